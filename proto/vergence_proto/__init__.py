@@ -1,0 +1,1 @@
+"""What client, service and models must agree on: geometry, value types, errors, bytes."""

@@ -1,0 +1,130 @@
+"""The contract between whoever exports a network and whoever serves it.
+
+A model is a set of ONNX graphs over the same weights, one per iteration count, and a manifest
+that describes them. One run of a graph is one step of the recurrence, for a batch of streams:
+
+=======================  ================  ==========================================================
+input                    type, shape       meaning
+=======================  ================  ==========================================================
+``left``, ``right``      uint8 [B,H,W,3]   rectified RGB; H and W are multiples of the model's stride
+``uvd_curr_from_prev``   float32 [B,4,4]   pixels of the previous frame to pixels of this one, see
+                                           :func:`vergence_proto.geometry.uvd_curr_from_prev`
+``prev_<tensor>``        float32 [B,C,h,w]  the state the previous step left; zeros on a cold start
+=======================  ================  ==========================================================
+
+=======================  ================  ==========================================================
+output                   type, shape       meaning
+=======================  ================  ==========================================================
+``disparity``            float32 [B,H,W]   pixel offset u_left - u_right, in full-resolution pixels
+``sigma``                float32 [B,H,W]   its expected absolute error, in pixels
+``next_<tensor>``        float32 [B,C,h,w]  the state for the next step
+=======================  ================  ==========================================================
+
+Pixel centres sit at integer coordinates. The matched quantity is the raw pixel offset, also where
+the two principal points differ: the transform carries that difference.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+LEFT = "left"
+RIGHT = "right"
+UVD_CURR_FROM_PREV = "uvd_curr_from_prev"
+DISPARITY = "disparity"
+SIGMA = "sigma"
+
+MANIFEST_NAME = "manifest.json"
+MANIFEST_FORMAT = 1
+
+
+class ManifestError(ValueError):
+    """A manifest or a graph it names is missing, damaged, or of another format."""
+
+
+@dataclass(frozen=True, slots=True)
+class StateTensor:
+    """One tensor of the recurrent state: float32 [B, channels, H / scale, W / scale]."""
+
+    name: str
+    channels: int
+    scale: int
+
+    @property
+    def input_name(self) -> str:
+        return f"prev_{self.name}"
+
+    @property
+    def output_name(self) -> str:
+        return f"next_{self.name}"
+
+    def shape(self, height: int, width: int) -> tuple[int, int, int]:
+        return self.channels, height // self.scale, width // self.scale
+
+
+@dataclass(frozen=True, slots=True)
+class ModelCard:
+    """What the manifest says about one model."""
+
+    name: str
+    stride: int  # H and W of a step are multiples of it
+    max_disparity_px: int
+    state: tuple[StateTensor, ...]  # in the order of the graph's inputs
+    graphs: Mapping[int, Path]  # iterations -> file
+    weights_sha256: str  # of all graphs together: the identity told to clients
+
+    def iterations_at_most(self, wanted: int) -> int:
+        """The largest exported count that does not exceed ``wanted`` (at least the smallest)."""
+        fitting = [count for count in self.graphs if count <= wanted]
+        return max(fitting) if fitting else min(self.graphs)
+
+
+def load_model_card(weights_dir: Path, name: str) -> ModelCard:
+    """Read one model's card from ``weights_dir`` and check its graphs against their sha256.
+
+    Raises ManifestError: file missing, unknown format, unknown model, or a hash that differs.
+    """
+    path = weights_dir / MANIFEST_NAME
+    try:
+        manifest = json.loads(path.read_text("utf-8"))
+    except FileNotFoundError:
+        raise ManifestError(f"no manifest at {path}; export a model there first") from None
+    except json.JSONDecodeError as error:
+        raise ManifestError(f"{path} is not JSON: {error}") from None
+    if manifest.get("format") != MANIFEST_FORMAT:
+        raise ManifestError(
+            f"{path}: expected manifest format {MANIFEST_FORMAT}, got {manifest.get('format')!r}"
+        )
+    models = manifest["models"]
+    if name not in models:
+        raise ManifestError(f"{path} has no model {name!r}; it has {', '.join(sorted(models))}")
+    entry = models[name]
+    digests = {
+        int(count): _checked_digest(weights_dir / graph["file"], graph["sha256"])
+        for count, graph in entry["graphs"].items()
+    }
+    return ModelCard(
+        name=name,
+        stride=entry["stride"],
+        max_disparity_px=entry["max_disparity_px"],
+        state=tuple(StateTensor(**tensor) for tensor in entry["state"]),
+        graphs={int(count): weights_dir / graph["file"] for count, graph in entry["graphs"].items()},
+        weights_sha256=hashlib.sha256(
+            b"".join(digests[count] for count in sorted(digests))
+        ).hexdigest(),
+    )
+
+
+def _checked_digest(path: Path, expected: str) -> bytes:
+    try:
+        digest = hashlib.sha256(path.read_bytes())
+    except FileNotFoundError:
+        raise ManifestError(f"the manifest names {path}, which does not exist") from None
+    if digest.hexdigest() != expected:
+        raise ManifestError(
+            f"{path}: expected sha256 {expected}, got {digest.hexdigest()}; "
+            "the file is damaged or the manifest is of another export"
+        )
+    return digest.digest()
