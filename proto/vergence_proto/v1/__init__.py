@@ -1,0 +1,1 @@
+"""Generated from depth.proto by ``python proto/generate.py``; never edited."""
