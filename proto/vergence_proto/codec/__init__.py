@@ -1,0 +1,68 @@
+"""Bytes to values and back: the only place where what came over the wire is checked.
+
+Everything ``..._from_proto`` returns holds what :mod:`vergence_proto.types` promises; whatever does
+not is refused here, with the :class:`~vergence_proto.errors.DepthError` that says what was expected
+and what came. Below this border nothing is checked again.
+"""
+
+from vergence_proto.codec.frames import (
+    delivery_from_proto,
+    delivery_to_proto,
+    disparity_from_proto,
+    disparity_to_proto,
+    error_from_frame_error,
+    error_to_frame_error,
+    frame_from_proto,
+    frame_to_proto,
+    origin_from_proto,
+    origin_to_proto,
+    output_format_from_proto,
+    output_format_to_proto,
+    timings_from_proto,
+    timings_to_proto,
+)
+from vergence_proto.codec.images import image_from_proto, image_to_proto
+from vergence_proto.codec.planes import plane_from_proto, plane_to_proto
+from vergence_proto.codec.rigs import (
+    axes_from_proto,
+    axes_to_proto,
+    pose_from_proto,
+    pose_sample_from_proto,
+    pose_sample_to_proto,
+    pose_to_proto,
+    rectified_rig_from_proto,
+    rectified_rig_to_proto,
+    rig_from_proto,
+    rig_to_proto,
+)
+
+__all__ = [
+    "axes_from_proto",
+    "axes_to_proto",
+    "delivery_from_proto",
+    "delivery_to_proto",
+    "disparity_from_proto",
+    "disparity_to_proto",
+    "error_from_frame_error",
+    "error_to_frame_error",
+    "frame_from_proto",
+    "frame_to_proto",
+    "image_from_proto",
+    "image_to_proto",
+    "origin_from_proto",
+    "origin_to_proto",
+    "output_format_from_proto",
+    "output_format_to_proto",
+    "plane_from_proto",
+    "plane_to_proto",
+    "pose_from_proto",
+    "pose_sample_from_proto",
+    "pose_sample_to_proto",
+    "pose_to_proto",
+    "rectified_rig_from_proto",
+    "rectified_rig_to_proto",
+    "rig_from_proto",
+    "rig_to_proto",
+    "timings_from_proto",
+    "timings_to_proto",
+]

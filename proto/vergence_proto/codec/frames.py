@@ -1,0 +1,231 @@
+"""Stereo frames in, disparity maps and errors out."""
+
+import math
+
+from vergence_proto.codec.enums import (
+    COMPRESSED,
+    DELIVERY,
+    DISPARITY_ENCODING,
+    ORIGIN,
+    number_of,
+    value_of,
+)
+from vergence_proto.codec.images import image_from_proto, image_to_proto
+from vergence_proto.codec.planes import (
+    bytes_plane_from_proto,
+    bytes_plane_to_proto,
+    check_denominator,
+    plane_from_proto,
+    plane_to_proto,
+)
+from vergence_proto.codec.rigs import (
+    pose_from_proto,
+    pose_sample_from_proto,
+    pose_sample_to_proto,
+    pose_to_proto,
+)
+from vergence_proto.errors import BadImage, BadShape, DepthError, error_from_wire
+from vergence_proto.geometry import RectifiedRig
+from vergence_proto.types import (
+    Delivery,
+    DisparityMap,
+    Image,
+    ImageEncoding,
+    Origin,
+    OutputFormat,
+    StereoFrame,
+    Timings,
+)
+from vergence_proto.v1 import depth_pb2 as pb
+
+_MICROSECONDS = 1e6
+_LARGEST_UINT32 = 2**32 - 1
+
+
+def frame_to_proto(
+    frame: StereoFrame,
+    *,
+    encoding: ImageEncoding,
+    jpeg_quality: int = 90,
+    max_age_s: float | None = None,
+) -> pb.Frame:
+    """Raises BadImage or BadPose: the frame holds what no server would take."""
+    message = pb.Frame(
+        frame_id=frame.frame_id,
+        capture_ns=frame.capture_ns,
+        left=image_to_proto(frame.left, encoding, jpeg_quality=jpeg_quality),
+        right=image_to_proto(frame.right, encoding, jpeg_quality=jpeg_quality),
+        max_age_s=max_age_s,
+    )
+    if frame.pose is not None:
+        message.pose.CopyFrom(pose_sample_to_proto(frame.pose))
+    return message
+
+
+def frame_from_proto(message: pb.Frame) -> StereoFrame:
+    """Decode both images and the pose.
+
+    Raises BadShape: no frame id, two sizes, or a maximum age that is no length of time.
+    Raises BadImage, BadPose: as :func:`image_from_proto` and :func:`pose_sample_from_proto`.
+    """
+    if message.frame_id == 0:
+        raise BadShape("expected a frame_id from 1 upwards, got 0")
+    if message.HasField("max_age_s") and not 0 <= message.max_age_s < math.inf:
+        raise BadShape(f"expected a max_age_s from 0 upwards, got {message.max_age_s}")
+    left, right = message.left, message.right
+    if (left.width, left.height) != (right.width, right.height):
+        raise BadShape(
+            f"both images must have one size, got left {left.width}x{left.height} "
+            f"and right {right.width}x{right.height}"
+        )
+    return StereoFrame(
+        frame_id=message.frame_id,
+        capture_ns=message.capture_ns,
+        left=_side(left, "left"),
+        right=_side(right, "right"),
+        pose=pose_sample_from_proto(message.pose) if message.HasField("pose") else None,
+    )
+
+
+def disparity_to_proto(disparity: DisparityMap, output: OutputFormat) -> pb.DisparityMap:
+    """Encode a map; its pose goes as it is, so the caller has put it into the stream's axes."""
+    message = pb.DisparityMap(
+        frame_id=disparity.frame_id,
+        capture_ns=disparity.capture_ns,
+        disparity=plane_to_proto(disparity.disparity_px, output),
+        origin=origin_to_proto(disparity.origin),
+        step_count=disparity.step_count,
+        iterations=disparity.iterations,
+        frames_skipped=disparity.frames_skipped,
+        timings=timings_to_proto(disparity.timings),
+    )
+    if output.confidence and disparity.confidence is not None:
+        confidence = bytes_plane_to_proto(disparity.confidence, compressed=output.compressed)
+        message.confidence.CopyFrom(confidence)
+    if output.sigma and disparity.sigma_px is not None:
+        message.sigma.CopyFrom(plane_to_proto(disparity.sigma_px, output))
+    if disparity.world_from_left is not None:
+        message.world_from_left.CopyFrom(pose_to_proto(disparity.world_from_left))
+    return message
+
+
+def disparity_from_proto(message: pb.DisparityMap, rig: RectifiedRig) -> DisparityMap:
+    """Decode a map of ``rig``, the rig that the stream's opening stated.
+
+    Raises BadShape: a plane of another size. Raises BadImage: as :func:`plane_from_proto`.
+    """
+    for name in ("disparity", "confidence", "sigma"):
+        plane: pb.Plane = getattr(message, name)
+        wanted = name == "disparity" or message.HasField(name)
+        if wanted and (plane.width, plane.height) != (rig.width, rig.height):
+            raise BadShape(
+                f"expected a {name} plane of {rig.width}x{rig.height}, the stream's rig, "
+                f"got {plane.width}x{plane.height}"
+            )
+    return DisparityMap(
+        frame_id=message.frame_id,
+        capture_ns=message.capture_ns,
+        rig=rig,
+        disparity_px=plane_from_proto(message.disparity),
+        sigma_px=plane_from_proto(message.sigma) if message.HasField("sigma") else None,
+        confidence=bytes_plane_from_proto(message.confidence)
+        if message.HasField("confidence")
+        else None,
+        world_from_left=pose_from_proto(message.world_from_left)
+        if message.HasField("world_from_left")
+        else None,
+        origin=origin_from_proto(message.origin),
+        step_count=message.step_count,
+        iterations=message.iterations,
+        frames_skipped=message.frames_skipped,
+        timings=timings_from_proto(message.timings),
+    )
+
+
+def output_format_to_proto(output: OutputFormat) -> pb.OutputFormat:
+    """Raises BadShape: a denominator out of 16 to 64."""
+    return pb.OutputFormat(
+        encoding=number_of(DISPARITY_ENCODING, output.encoding),
+        denominator=check_denominator(output.denominator),
+        compression=number_of(COMPRESSED, output.compressed),
+        confidence=output.confidence,
+        sigma=output.sigma,
+    )
+
+
+def output_format_from_proto(message: pb.OutputFormat) -> OutputFormat:
+    """What is not specified is :class:`OutputFormat`'s default.
+
+    Raises BadShape: a denominator out of 16 to 64, or a number that depth.proto does not have.
+    """
+    return OutputFormat(
+        encoding=value_of(DISPARITY_ENCODING, message.encoding, "output encoding"),
+        denominator=check_denominator(message.denominator or OutputFormat().denominator),
+        compressed=value_of(COMPRESSED, message.compression, "output compression"),
+        confidence=message.confidence,
+        sigma=message.sigma,
+    )
+
+
+def delivery_to_proto(delivery: Delivery) -> pb.Delivery:
+    return number_of(DELIVERY, delivery)
+
+
+def delivery_from_proto(delivery: pb.Delivery) -> Delivery:
+    """Unspecified means newest. Raises BadShape: a number that depth.proto does not have."""
+    return value_of(DELIVERY, delivery, "delivery")
+
+
+def origin_to_proto(origin: Origin) -> pb.Origin:
+    return number_of(ORIGIN, origin)
+
+
+def origin_from_proto(origin: pb.Origin) -> Origin:
+    """Raises BadShape: a number that depth.proto does not have."""
+    return value_of(ORIGIN, origin, "origin")
+
+
+def timings_to_proto(timings: Timings) -> pb.Timings:
+    return pb.Timings(
+        decode_us=_microseconds(timings.decode_s),
+        queue_us=_microseconds(timings.queue_s),
+        model_us=_microseconds(timings.model_s),
+        encode_us=_microseconds(timings.encode_s),
+        total_us=_microseconds(timings.total_s),
+    )
+
+
+def timings_from_proto(message: pb.Timings) -> Timings:
+    return Timings(
+        decode_s=message.decode_us / _MICROSECONDS,
+        queue_s=message.queue_us / _MICROSECONDS,
+        model_s=message.model_us / _MICROSECONDS,
+        encode_s=message.encode_us / _MICROSECONDS,
+        total_s=message.total_us / _MICROSECONDS,
+    )
+
+
+def error_to_frame_error(frame_id: int, error: DepthError) -> pb.FrameError:
+    return pb.FrameError(
+        frame_id=frame_id,
+        reason=error.code,
+        message=str(error),
+        retry_after_s=error.retry_after_s,
+    )
+
+
+def error_from_frame_error(message: pb.FrameError) -> DepthError:
+    """The error that the server raised about one frame, of the same class."""
+    retry_after_s = message.retry_after_s if message.HasField("retry_after_s") else None
+    return error_from_wire(message.reason, message.message, retry_after_s)
+
+
+def _side(message: pb.Image, side: str) -> Image:
+    try:
+        return image_from_proto(message)
+    except BadImage as error:
+        raise BadImage(f"{side} image: {error}") from None
+
+
+def _microseconds(seconds: float) -> int:
+    return min(max(round(seconds * _MICROSECONDS), 0), _LARGEST_UINT32)

@@ -1,0 +1,168 @@
+"""Result planes: float32 [H, W] to fixed point or IEEE bytes, and back.
+
+UINT16 stores round(value * denominator) and 0 for "no value". Compression is lossless: every row
+as differences from the pixel before, modulo 2^16, then all low bytes before all high ones, then
+one zstd frame.
+"""
+
+import threading
+from typing import Any
+
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+from vergence_proto.errors import BadImage, BadShape
+from vergence_proto.types import OutputFormat, Plane, PlaneEncoding
+from vergence_proto.v1 import depth_pb2 as pb
+
+Stored = NDArray[Any]  # [H, W] of a type that only the message knows
+
+_LARGEST = np.float32(np.iinfo(np.uint16).max)
+_ZSTD_LEVEL = 1
+_WIRE_TYPES: dict[int, np.dtype[Any]] = {
+    pb.PLANE_ENCODING_UINT8: np.dtype("u1"),
+    pb.PLANE_ENCODING_UINT16: np.dtype("<u2"),
+    pb.PLANE_ENCODING_FLOAT16: np.dtype("<f2"),
+    pb.PLANE_ENCODING_FLOAT32: np.dtype("<f4"),
+}
+
+
+class _ZstdOfThread(threading.local):
+    """Contexts are costly to make and must not be shared between threads."""
+
+    def __init__(self) -> None:
+        self.compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL)
+        self.decompressor = zstandard.ZstdDecompressor()
+
+
+_zstd = _ZstdOfThread()
+
+
+def plane_to_proto(plane: Plane, output: OutputFormat) -> pb.Plane:
+    """Encode float32 [H, W], NaN where there is no value, as ``output`` says.
+
+    UINT16 cannot tell zero or a negative number from "no value"; it saturates above, and keeps a
+    positive value that is below half a step as one step.
+    """
+    height, width = plane.shape
+    match output.encoding:
+        case PlaneEncoding.UINT16:
+            stored = _fixed_point(plane, output.denominator)
+            message = _integers_to_proto(stored, compressed=output.compressed)
+            message.denominator = output.denominator
+            return message
+        case PlaneEncoding.FLOAT16:
+            kind = pb.PLANE_ENCODING_FLOAT16
+        case PlaneEncoding.FLOAT32:
+            kind = pb.PLANE_ENCODING_FLOAT32
+    return pb.Plane(
+        encoding=kind,
+        compression=pb.COMPRESSION_NONE,
+        width=width,
+        height=height,
+        data=plane.astype(_WIRE_TYPES[kind], copy=False).tobytes(),
+    )
+
+
+def bytes_plane_to_proto(plane: NDArray[np.uint8], *, compressed: bool) -> pb.Plane:
+    """Encode uint8 [H, W]."""
+    return _integers_to_proto(plane, compressed=compressed)
+
+
+def plane_from_proto(message: pb.Plane) -> Plane:
+    """Decode to float32 [H, W], NaN where there is no value.
+
+    Raises BadImage: bytes that are not a whole plane of the stated encoding, compression and size.
+    """
+    if message.encoding == pb.PLANE_ENCODING_UINT8:
+        raise BadImage("expected a plane of values, got one of UINT8")
+    stored = _stored(message)
+    if message.encoding != pb.PLANE_ENCODING_UINT16:
+        return stored.astype(np.float32)
+    if message.denominator == 0:
+        raise BadImage("a UINT16 plane needs a denominator above 0")
+    values: Plane = np.divide(stored, message.denominator, dtype=np.float32)
+    values[stored == 0] = np.nan
+    return values
+
+
+def bytes_plane_from_proto(message: pb.Plane) -> NDArray[np.uint8]:
+    """Decode uint8 [H, W]. Raises BadImage: as :func:`plane_from_proto`."""
+    if message.encoding != pb.PLANE_ENCODING_UINT8:
+        raise BadImage(f"expected a UINT8 plane, got encoding {message.encoding}")
+    return _stored(message).astype(np.uint8)
+
+
+def check_denominator(denominator: int) -> int:
+    """Raises BadShape: out of 16 to 64."""
+    if not 16 <= denominator <= 64:
+        raise BadShape(f"expected a denominator of 16 to 64, got {denominator}")
+    return denominator
+
+
+def _fixed_point(plane: Plane, denominator: int) -> NDArray[np.uint16]:
+    scaled = np.multiply(plane, np.float32(denominator))
+    np.fmax(scaled, 0, out=scaled)  # of NaN and a number, fmax takes the number
+    positive = scaled > 0
+    np.rint(scaled, out=scaled)
+    np.minimum(scaled, _LARGEST, out=scaled)
+    np.maximum(scaled, positive, out=scaled)
+    return scaled.astype("<u2")
+
+
+def _integers_to_proto(stored: Stored, *, compressed: bool) -> pb.Plane:
+    height, width = stored.shape
+    wide = stored.dtype.itemsize == 2
+    return pb.Plane(
+        encoding=pb.PLANE_ENCODING_UINT16 if wide else pb.PLANE_ENCODING_UINT8,
+        compression=pb.COMPRESSION_DELTA_ZSTD if compressed else pb.COMPRESSION_NONE,
+        width=width,
+        height=height,
+        data=_compress(stored) if compressed else stored.tobytes(),
+    )
+
+
+def _stored(message: pb.Plane) -> Stored:
+    if message.encoding not in _WIRE_TYPES:
+        raise BadImage(f"expected a plane encoding of depth.proto, got {message.encoding}")
+    dtype = _WIRE_TYPES[message.encoding]
+    shape = message.height, message.width
+    size = message.height * message.width * dtype.itemsize
+    if message.compression == pb.COMPRESSION_DELTA_ZSTD:
+        if dtype.kind != "u":
+            raise BadImage("only UINT16 and UINT8 planes can be compressed")
+        return _decompress(message.data, size, shape, dtype)
+    if message.compression not in (pb.COMPRESSION_NONE, pb.COMPRESSION_UNSPECIFIED):
+        raise BadImage(f"expected a compression of depth.proto, got {message.compression}")
+    if len(message.data) != size:
+        raise BadImage(
+            f"a {message.width}x{message.height} plane of {dtype.name} is {size} bytes, "
+            f"got {len(message.data)}"
+        )
+    plane: Stored = np.frombuffer(message.data, dtype).reshape(shape)
+    return plane
+
+
+def _compress(stored: Stored) -> bytes:
+    delta = np.empty_like(stored)
+    delta[:, 0] = stored[:, 0]
+    np.subtract(stored[:, 1:], stored[:, :-1], out=delta[:, 1:])
+    itemsize = stored.dtype.itemsize
+    shuffled = np.ascontiguousarray(delta.view(np.uint8).reshape(-1, itemsize).T)
+    return _zstd.compressor.compress(shuffled.data)
+
+
+def _decompress(data: bytes, size: int, shape: tuple[int, int], dtype: np.dtype[Any]) -> Stored:
+    # The size is in the frame's header: read it before anything is allocated on its word.
+    try:
+        announced = zstandard.frame_content_size(data)
+        if announced != size:
+            raise BadImage(f"expected {size} bytes in the zstd frame, it announces {announced}")
+        shuffled = _zstd.decompressor.decompress(data, allow_extra_data=False)
+    except zstandard.ZstdError as error:
+        raise BadImage(f"the plane's zstd frame is damaged: {error}") from None
+    delta = np.frombuffer(shuffled, np.uint8).reshape(dtype.itemsize, -1).T
+    delta = np.ascontiguousarray(delta).view(dtype).reshape(shape)
+    stored: Stored = np.add.accumulate(delta, axis=1, dtype=dtype)
+    return stored
