@@ -1,10 +1,11 @@
 """Result planes: float32 [H, W] to fixed point or IEEE bytes, and back.
 
-UINT16 stores round(value * denominator) and 0 for "no value". Compression is lossless: every row
-as differences from the pixel before, modulo 2^16, then all low bytes before all high ones, then
-one zstd frame.
+UINT16 stores round(value * denominator) and 0 for "no value". Compression is lossless: differences
+from the row above (modulo 2^16), folded to small unsigned numbers (0 -1 1 -2 2 to 0 1 2 3 4), all
+low bytes before all high ones, one zstd frame.
 """
 
+import itertools
 import threading
 from typing import Any
 
@@ -42,8 +43,8 @@ _zstd = _ZstdOfThread()
 def plane_to_proto(plane: Plane, output: OutputFormat) -> pb.Plane:
     """Encode float32 [H, W], NaN where there is no value, as ``output`` says.
 
-    UINT16 cannot tell zero or a negative number from "no value"; it saturates above, and keeps a
-    positive value that is below half a step as one step.
+    UINT16 has no zero and no negative number: what is below half a step becomes "no value". Above
+    65535 / denominator it saturates.
     """
     height, width = plane.shape
     match output.encoding:
@@ -104,10 +105,8 @@ def check_denominator(denominator: int) -> int:
 def _fixed_point(plane: Plane, denominator: int) -> NDArray[np.uint16]:
     scaled = np.multiply(plane, np.float32(denominator))
     np.fmax(scaled, 0, out=scaled)  # of NaN and a number, fmax takes the number
-    positive = scaled > 0
-    np.rint(scaled, out=scaled)
     np.minimum(scaled, _LARGEST, out=scaled)
-    np.maximum(scaled, positive, out=scaled)
+    np.rint(scaled, out=scaled)
     return scaled.astype("<u2")
 
 
@@ -129,6 +128,8 @@ def _stored(message: pb.Plane) -> Stored:
     dtype = _WIRE_TYPES[message.encoding]
     shape = message.height, message.width
     size = message.height * message.width * dtype.itemsize
+    if size == 0:
+        raise BadImage(f"expected a size in pixels, got {message.width}x{message.height}")
     if message.compression == pb.COMPRESSION_DELTA_ZSTD:
         if dtype.kind != "u":
             raise BadImage("only UINT16 and UINT8 planes can be compressed")
@@ -146,23 +147,31 @@ def _stored(message: pb.Plane) -> Stored:
 
 def _compress(stored: Stored) -> bytes:
     delta = np.empty_like(stored)
-    delta[:, 0] = stored[:, 0]
-    np.subtract(stored[:, 1:], stored[:, :-1], out=delta[:, 1:])
+    delta[0] = stored[0]
+    np.subtract(stored[1:], stored[:-1], out=delta[1:])
     itemsize = stored.dtype.itemsize
-    shuffled = np.ascontiguousarray(delta.view(np.uint8).reshape(-1, itemsize).T)
+    sign = delta.view(f"<i{itemsize}") >> (8 * itemsize - 1)  # 0 or -1
+    folded = (delta << 1) ^ sign.view(delta.dtype)
+    shuffled = np.empty((itemsize, *stored.shape), np.uint8)
+    for byte, plane in enumerate(shuffled):
+        np.copyto(plane, folded >> (8 * byte), casting="unsafe")
     return _zstd.compressor.compress(shuffled.data)
 
 
 def _decompress(data: bytes, size: int, shape: tuple[int, int], dtype: np.dtype[Any]) -> Stored:
-    # The size is in the frame's header: read it before anything is allocated on its word.
     try:
+        # The size is in the frame's header: read it before anything is allocated on its word.
         announced = zstandard.frame_content_size(data)
         if announced != size:
             raise BadImage(f"expected {size} bytes in the zstd frame, it announces {announced}")
-        shuffled = _zstd.decompressor.decompress(data, allow_extra_data=False)
+        unpacked = _zstd.decompressor.decompress(data, allow_extra_data=False)
     except zstandard.ZstdError as error:
         raise BadImage(f"the plane's zstd frame is damaged: {error}") from None
-    delta = np.frombuffer(shuffled, np.uint8).reshape(dtype.itemsize, -1).T
-    delta = np.ascontiguousarray(delta).view(dtype).reshape(shape)
-    stored: Stored = np.add.accumulate(delta, axis=1, dtype=dtype)
+    shuffled = np.frombuffer(unpacked, np.uint8).reshape(dtype.itemsize, *shape)
+    folded: Stored = shuffled[0].astype(dtype)
+    for byte, plane in enumerate(shuffled[1:], start=1):
+        folded |= plane.astype(dtype) << (8 * byte)
+    stored: Stored = (folded >> 1) ^ np.negative(folded & 1)
+    for above, row in itertools.pairwise(stored):  # four times as quick as accumulate on axis 0
+        np.add(row, above, out=row)
     return stored
