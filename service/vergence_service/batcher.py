@@ -1,0 +1,146 @@
+"""The steps that wait for the model, taken together across streams in one dedicated thread."""
+
+import asyncio
+import logging
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Self
+
+from vergence_proto.errors import DepthError, Draining, FrameStale, ModelFailed
+from vergence_service.metrics import Metrics
+from vergence_service.model import Step, StepResult, StereoModel
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TimedResult:
+    result: StepResult
+    queue_s: float  # from the request to the start of the batch
+    model_s: float  # of the whole batch
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Waiting:
+    step: Step
+    since_s: float
+    deadline_s: float | None
+    answer: asyncio.Future[TimedResult]
+
+    @property
+    def shape_of_work(self) -> tuple[object, ...]:
+        """Rows can share a batch if this is equal."""
+        return self.step.view.left.shape, self.step.iterations
+
+
+class StepBatcher:
+    """Gathers the steps that wait for the model and runs them together, oldest first.
+
+    Every waiter gets a result or an exception: ModelFailed, NonFinite, FrameStale, or Draining
+    when the batcher ends first. A caller never has two steps of one stream waiting.
+    """
+
+    def __init__(
+        self,
+        model: StereoModel,
+        *,
+        max_batch: int,
+        clock: Callable[[], float],
+        metrics: Metrics,
+    ) -> None:
+        self._model = model
+        self._max_batch = max_batch
+        self._clock = clock
+        self._metrics = metrics
+        self._waiting: list[_Waiting] = []
+        self._arrived = asyncio.Event()
+
+    async def __aenter__(self) -> Self:
+        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="model")
+        self._worker = asyncio.create_task(self._run(), name="step-batcher")
+        return self
+
+    async def __aexit__(self, *exc_info: object) -> None:
+        self._worker.cancel()
+        await asyncio.gather(self._worker, return_exceptions=True)
+        await asyncio.to_thread(self._thread.shutdown)
+        for item in _wanted(self._waiting):
+            item.answer.set_exception(Draining("the server stopped before it took the frame"))
+
+    async def warm_up(self, iterations: Sequence[int]) -> None:
+        """Load the model, in the thread that will run it."""
+        loop = asyncio.get_running_loop()
+        await loop.run_in_executor(self._thread, self._model.warm_up, iterations)
+
+    async def step(self, step: Step, *, deadline_s: float | None = None) -> TimedResult:
+        """The result of one step; FrameStale if the model was not free before ``deadline_s``."""
+        answer: asyncio.Future[TimedResult] = asyncio.get_running_loop().create_future()
+        self._waiting.append(_Waiting(step, self._clock(), deadline_s, answer))
+        self._arrived.set()
+        return await answer
+
+    async def _run(self) -> None:
+        batch: list[_Waiting] = []
+        try:
+            while True:
+                await self._arrived.wait()
+                batch = self._next_batch()
+                if batch:
+                    await self._step_together(batch)
+        finally:
+            self._waiting += batch  # those without an answer get one from __aexit__
+
+    def _next_batch(self) -> list[_Waiting]:
+        now_s = self._clock()
+        wanted = _wanted(self._waiting)
+        for item in wanted:
+            if item.deadline_s is not None and now_s > item.deadline_s:
+                item.answer.set_exception(
+                    FrameStale(
+                        f"the frame waited {now_s - item.since_s:.3f} s for the model, past its "
+                        "maximum age; the stream is as it was"
+                    )
+                )
+        wanted = _wanted(wanted)
+        work = wanted[0].shape_of_work if wanted else None
+        batch = [item for item in wanted if item.shape_of_work == work][: self._max_batch]
+        self._waiting = [item for item in wanted if item not in batch]
+        if not self._waiting:
+            self._arrived.clear()
+        return batch
+
+    async def _step_together(self, batch: list[_Waiting]) -> None:
+        started_s = self._clock()
+        steps = [item.step for item in batch]
+        loop = asyncio.get_running_loop()
+        try:
+            results = await loop.run_in_executor(self._thread, self._model.step, steps)
+        except Exception as error:
+            if len(batch) == 1:
+                _fail(batch[0], error)
+                return
+            # One bad row must not fail its neighbours: find it by stepping each alone.
+            for item in _wanted(batch):
+                await self._step_together([item])
+            return
+        model_s = self._clock() - started_s
+        self._metrics.batch_size.observe(len(batch))
+        for item, result in zip(batch, results, strict=True):
+            if not item.answer.done():
+                queue_s = started_s - item.since_s
+                item.answer.set_result(TimedResult(result, queue_s, model_s))
+
+
+def _wanted(items: Sequence[_Waiting]) -> list[_Waiting]:
+    """A caller that gave up leaves a finished future behind; setting it again would raise."""
+    return [item for item in items if not item.answer.done()]
+
+
+def _fail(item: _Waiting, error: Exception) -> None:
+    if item.answer.done():
+        return
+    if not isinstance(error, DepthError):
+        log.error("the model raised", exc_info=error)
+        error = ModelFailed("the model failed on this frame; the stream is as it was before it")
+    item.answer.set_exception(error)

@@ -1,0 +1,259 @@
+"""The use case: open a stream, step it frame by frame, close it."""
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vergence_proto.errors import (
+    BadShape,
+    DepthError,
+    Draining,
+    FrameTooLarge,
+    NonFinite,
+    NotReady,
+)
+from vergence_proto.geometry import Pose
+from vergence_proto.model_io import ModelCard
+from vergence_proto.types import (
+    DisparityMap,
+    Origin,
+    Plane,
+    StereoFrame,
+    Timings,
+)
+from vergence_service.batcher import StepBatcher, TimedResult
+from vergence_service.continuity import ContinuityLimits
+from vergence_service.metrics import Metrics
+from vergence_service.model import Step, View, state_bytes
+from vergence_service.rectify import Rectifier
+from vergence_service.streams import Attachment, Notice, NoticeKind, Opening, Stream, StreamTable
+
+
+class DepthEngine:
+    """Everything a transport may ask for. It knows no wire, and raises only DepthError."""
+
+    def __init__(
+        self,
+        streams: StreamTable,
+        batcher: StepBatcher,
+        *,
+        card: ModelCard,
+        iterations: int,
+        cold_iterations: int,
+        limits: ContinuityLimits,
+        max_pixels: int,
+        clock: Callable[[], float],
+        metrics: Metrics,
+    ) -> None:
+        self.streams = streams
+        self.card = card
+        self.max_pixels = max_pixels
+        self.metrics = metrics
+        self._batcher = batcher
+        self._iterations = iterations
+        self._cold_iterations = cold_iterations
+        self._limits = limits
+        self._clock = clock
+        self._refusal: DepthError | None = NotReady(
+            "the model is loading; try again", retry_after_s=1.0
+        )
+
+    async def start(self) -> None:
+        """Load the model; until it is done every opening is refused with NotReady."""
+        counts = {self._iterations, self._cold_iterations}
+        await self._batcher.warm_up(sorted(map(self.card.iterations_at_most, counts)))
+        self._refusal = None
+
+    def drain(self, *, within_s: float) -> None:
+        """Take no new stream, and tell those that are attached."""
+        self._refusal = Draining("the server is shutting down; try another one")
+        notice = Notice(NoticeKind.DRAINING, "the server is shutting down", within_s)
+        for attachment in self.streams.attachments():
+            attachment.notify(notice)
+
+    async def open(
+        self, stream_id: str, opening: Opening, attachment: Attachment | None = None
+    ) -> Stream:
+        """Raises NotReady, Draining, BadCalibration, FrameTooLarge, and as StreamTable.open."""
+        if self._refusal is not None:
+            raise self._refusal
+        width, height = opening.rig.left.width, opening.rig.left.height
+        if width * height > self.max_pixels:
+            raise FrameTooLarge(
+                f"expected at most {self.max_pixels} pixels an image, got {width}x{height}"
+            )
+        rectifier = await asyncio.to_thread(Rectifier.of, opening.rig)
+        reserve = state_bytes(self.card, height, width)
+        return self.streams.open(
+            stream_id, opening, rectifier, state_bytes=reserve, attachment=attachment
+        )
+
+    def resume(
+        self, stream_id: str, resume_token: bytes, opening: Opening, attachment: Attachment
+    ) -> Stream:
+        """Attach to a stream that is open. Raises Draining, and as StreamTable.attach."""
+        if self._refusal is not None:
+            raise self._refusal
+        return self.streams.attach(stream_id, resume_token, opening, attachment)
+
+    async def step(
+        self,
+        stream_id: str,
+        decode: Callable[[], StereoFrame],
+        *,
+        arrived_s: float,
+        max_age_s: float | None = None,
+    ) -> DisparityMap:
+        """Advance one stream by one frame; a step that failed has left the stream as it was.
+
+        ``decode`` runs in a worker thread when the frame's turn has come, so a frame that is
+        displaced before is never decoded. Raises what it raises, UnknownStream, StreamExpired,
+        BadShape, FrameOutOfOrder, FrameStale, ModelFailed; and NonFinite, after which the
+        stream starts anew.
+        """
+        stream = self.streams.get(stream_id)
+        self.streams.touch(stream)
+        # The lock wakes its waiters in order, so a stream takes its frames one at a time as they
+        # arrived, and no batch ever holds two frames of one stream.
+        async with stream.turn:
+            try:
+                answer = await self._advance(stream, decode, arrived_s, max_age_s)
+            except DepthError as error:
+                self._count_failure(stream, error)
+                raise
+        return await asyncio.to_thread(answer.disparity_map)
+
+    async def reset(self, stream_id: str) -> None:
+        """Frames after it start from nothing. Raises UnknownStream, StreamExpired."""
+        stream = self.streams.get(stream_id)
+        async with stream.turn:
+            stream.forget(Origin.RESET_REQUESTED)
+
+    def count_dropped(self, stream: Stream) -> None:
+        """A frame of the stream was displaced by a newer one."""
+        stream.frames_dropped += 1
+        stream.frames_skipped += 1
+        self.metrics.frames_dropped.inc()
+
+    def close(self, stream_id: str) -> Stream:
+        """End a stream and free its state. Raises UnknownStream, StreamExpired."""
+        stream = self.streams.get(stream_id)
+        self.streams.close(stream)
+        return stream
+
+    async def _advance(
+        self,
+        stream: Stream,
+        decode: Callable[[], StereoFrame],
+        arrived_s: float,
+        max_age_s: float | None,
+    ) -> "_Answer":
+        started_s = self._clock()
+        frame, view = await asyncio.to_thread(_decoded_view, decode, stream)
+        decode_s = self._clock() - started_s
+        stream.check_order(frame.frame_id)
+        state, origin = stream.state_before(view, self._limits)
+        iterations = self._iterations_of(stream.opening, cold=state is None)
+        timed = await self._batcher.step(
+            Step(view, state, iterations),
+            deadline_s=None if max_age_s is None else arrived_s + max_age_s,
+        )
+        skipped = stream.frames_skipped
+        stream.commit(frame.frame_id, timed.result.state)
+        self.metrics.frames_stepped.labels(origin.name.lower()).inc()
+        timings = Timings(
+            decode_s=decode_s,
+            queue_s=started_s - arrived_s + timed.queue_s,
+            model_s=timed.model_s,
+        )
+        for stage in ("decode", "queue", "model"):
+            self.metrics.stage_s.labels(stage).observe(getattr(timings, f"{stage}_s"))
+        return _Answer(stream, frame.frame_id, view, timed, origin, iterations, skipped, timings)
+
+    def _iterations_of(self, opening: Opening, *, cold: bool) -> int:
+        wanted = (
+            opening.cold_iterations or self._cold_iterations
+            if cold
+            else opening.iterations or self._iterations
+        )
+        return self.card.iterations_at_most(wanted)
+
+    def _count_failure(self, stream: Stream, error: DepthError) -> None:
+        stream.frames_failed += 1
+        stream.frames_skipped += 1
+        self.metrics.frames_failed.labels(error.code).inc()
+        if isinstance(error, NonFinite):
+            stream.forget(Origin.RESET_NON_FINITE)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Answer:
+    """A step that was taken, on its way to becoming a disparity map."""
+
+    stream: Stream
+    frame_id: int
+    view: View
+    timed: TimedResult
+    origin: Origin
+    iterations: int
+    frames_skipped: int
+    timings: Timings
+
+    def disparity_map(self) -> DisparityMap:
+        """Works on whole images, so it runs in a worker thread."""
+        result, opening = self.timed.result, self.stream.opening
+        pose = self.view.world_from_left
+        return DisparityMap(
+            frame_id=self.frame_id,
+            capture_ns=self.view.capture_ns,
+            rig=self.view.rig,
+            disparity_px=_disparity_px(result.offset_px, self.stream.rectifier),
+            sigma_px=result.sigma_px if opening.output.sigma else None,
+            confidence=_confidence(result.sigma_px) if opening.output.confidence else None,
+            world_from_left=None if pose is None else opening.axes.from_opencv(pose),
+            origin=self.origin,
+            step_count=result.state.step_count,
+            iterations=self.iterations,
+            frames_skipped=self.frames_skipped,
+            timings=self.timings,
+        )
+
+
+def _decoded_view(decode: Callable[[], StereoFrame], stream: Stream) -> tuple[StereoFrame, View]:
+    frame = decode()
+    rectifier, axes = stream.rectifier, stream.opening.axes
+    height, width = frame.left.shape[:2]
+    if (width, height) != (rectifier.rig.width, rectifier.rig.height):
+        raise BadShape(
+            f"expected images of {rectifier.rig.width}x{rectifier.rig.height}, the size the "
+            f"stream was opened with, got {width}x{height}"
+        )
+    left, right = rectifier.rectify(frame.left, frame.right)
+    pose: Pose | None = None
+    if frame.pose is not None and frame.pose.orientation_valid:
+        world_from_left = axes.to_opencv(frame.pose.world_from_left)
+        pose = world_from_left @ rectifier.left_from_rectified
+    position_known = frame.pose is not None and frame.pose.position_valid
+    return frame, View(left, right, rectifier.rig, frame.capture_ns, pose, position_known)
+
+
+def _disparity_px(offset_px: Plane, rectifier: Rectifier) -> Plane:
+    """Pixel offset to disparity: NaN where it is not positive or the camera saw nothing."""
+    disparity_px = offset_px - np.float32(rectifier.rig.offset_of_zero_disparity_px)
+    there = disparity_px > 0
+    if rectifier.seen is not None:
+        there &= rectifier.seen
+    disparity_px[~there] = np.nan
+    return disparity_px
+
+
+def _confidence(sigma_px: Plane) -> NDArray[np.uint8]:
+    """The probability of an error below one pixel, times 255.
+
+    Of a Laplace distribution, whose expected absolute error is its scale.
+    """
+    probability: Plane = 1 - np.exp(-1 / np.maximum(sigma_px, np.float32(1e-6)))
+    return np.rint(probability * 255).astype(np.uint8)

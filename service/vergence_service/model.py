@@ -1,0 +1,276 @@
+"""One step of the recurrence: a rectified pair and a state, to disparity and the next state.
+
+A state is a value. A step returns the next one and changes nothing, so whoever holds the old one
+may step it again; a sequence is a pure function of its frames.
+"""
+
+import importlib.util
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import onnxruntime
+from numpy.typing import NDArray
+
+from vergence_proto.errors import NonFinite
+from vergence_proto.geometry import Pose, RectifiedRig, uvd_curr_from_prev
+from vergence_proto.model_io import (
+    DISPARITY,
+    LEFT,
+    RIGHT,
+    SIGMA,
+    UVD_CURR_FROM_PREV,
+    ModelCard,
+    load_model_card,
+)
+from vergence_proto.types import Image, Plane
+
+log = logging.getLogger(__name__)
+
+Tensor = NDArray[np.float32]  # [C, h, w]
+
+_NO_MOTION = np.eye(4, dtype=np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """What one step looks at: a rectified pair and where its left camera was."""
+
+    left: Image
+    right: Image  # same shape as left
+    rig: RectifiedRig
+    capture_ns: int
+    world_from_left: Pose | None = None  # the rectified camera's, OpenCV axes; None: not known
+    position_known: bool = True  # False: only the rotation of world_from_left can be trusted
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecurrentState:
+    """What one step hands to the next: the network's tensors, and the view they belong to."""
+
+    tensors: tuple[Tensor, ...]  # in the order of the model card
+    rig: RectifiedRig
+    capture_ns: int
+    world_from_left: Pose | None
+    position_known: bool
+    step_count: int  # steps since the state was new
+
+    @classmethod
+    def after(
+        cls, view: View, previous: "RecurrentState | None", tensors: tuple[Tensor, ...]
+    ) -> "RecurrentState":
+        return cls(
+            tensors=tensors,
+            rig=view.rig,
+            capture_ns=view.capture_ns,
+            world_from_left=view.world_from_left,
+            position_known=view.position_known,
+            step_count=1 if previous is None else previous.step_count + 1,
+        )
+
+    @property
+    def nbytes(self) -> int:
+        return sum(tensor.nbytes for tensor in self.tensors)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """One row of a batch. A state is only given where it and the view have a pose."""
+
+    view: View
+    state: RecurrentState | None  # None: a cold start
+    iterations: int  # one of the model card's
+
+    @property
+    def uvd_curr_from_prev(self) -> NDArray[np.float32]:
+        """How the camera's motion moves pixels and disparities: [4, 4].
+
+        Rotation alone where either position is not known; the identity on a cold start.
+        """
+        if (
+            self.state is None
+            or self.state.world_from_left is None
+            or self.view.world_from_left is None
+        ):
+            return _NO_MOTION
+        curr_from_prev = self.view.world_from_left.inverse() @ self.state.world_from_left
+        if not (self.view.position_known and self.state.position_known):
+            curr_from_prev = Pose(curr_from_prev.rotation, np.zeros(3))
+        return uvd_curr_from_prev(self.view.rig, curr_from_prev, self.state.rig)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StepResult:
+    offset_px: Plane  # u_left - u_right, finite
+    sigma_px: Plane  # its expected absolute error, finite
+    state: RecurrentState
+
+
+class StereoModel(Protocol):
+    """A network that takes steps. Called from one thread at a time."""
+
+    @property
+    def card(self) -> ModelCard: ...
+
+    @property
+    def provider(self) -> str:
+        """What it runs on, as told to clients."""
+        ...
+
+    def warm_up(self, iterations: Sequence[int]) -> None:
+        """Do now what the first steps would otherwise wait for."""
+        ...
+
+    def step(self, steps: Sequence[Step]) -> list[StepResult]:
+        """Take one step of each stream; all have one image size and one iteration count.
+
+        Raises NonFinite if any row's result is not finite.
+        """
+        ...
+
+
+class ProviderUnavailable(RuntimeError):
+    """The execution provider asked for cannot be used on this machine."""
+
+
+# The names a person writes in the settings, and onnxruntime's.
+PROVIDERS: Mapping[str, str] = {
+    "cpu": "CPUExecutionProvider",
+    "cuda": "CUDAExecutionProvider",
+    "tensorrt": "TensorrtExecutionProvider",
+    "openvino": "OpenVINOExecutionProvider",
+}
+
+
+class OnnxStereoModel:
+    """A model of the manifest under onnxruntime: one graph per iteration count.
+
+    Raises ManifestError (see :func:`vergence_proto.model_io.load_model_card`) and
+    ProviderUnavailable.
+    """
+
+    def __init__(
+        self,
+        weights_dir: Path,
+        name: str,
+        *,
+        providers: Sequence[str],
+        threads: int,
+        allow_spinning: bool,
+    ) -> None:
+        self._card = load_model_card(weights_dir, name)
+        self._providers = [_available(provider) for provider in providers]
+        self._options = onnxruntime.SessionOptions()
+        self._options.intra_op_num_threads = threads
+        self._options.add_session_config_entry(
+            "session.intra_op.allow_spinning", "1" if allow_spinning else "0"
+        )
+        self._outputs = [
+            DISPARITY,
+            SIGMA,
+            *(tensor.output_name for tensor in self._card.state),
+        ]
+        self._sessions: dict[int, onnxruntime.InferenceSession] = {}
+
+    @property
+    def card(self) -> ModelCard:
+        return self._card
+
+    @property
+    def provider(self) -> str:
+        return self._providers[0]
+
+    def warm_up(self, iterations: Sequence[int]) -> None:
+        for count in iterations:
+            self._session(count)
+
+    def step(self, steps: Sequence[Step]) -> list[StepResult]:
+        height, width = steps[0].view.left.shape[:2]
+        disparity, sigma, *tensors = self._session(steps[0].iterations).run(
+            self._outputs, self._feeds(steps)
+        )
+        if not all(np.isfinite(output).all() for output in (disparity, sigma, *tensors)):
+            raise NonFinite("the network's result was not finite; the stream starts anew")
+        return [
+            StepResult(
+                disparity[row, :height, :width],
+                sigma[row, :height, :width],
+                RecurrentState.after(
+                    step.view, step.state, tuple(tensor[row] for tensor in tensors)
+                ),
+            )
+            for row, step in enumerate(steps)
+        ]
+
+    def _feeds(self, steps: Sequence[Step]) -> dict[str, NDArray[np.generic]]:
+        left = _stack([_padded(step.view.left, self._card.stride) for step in steps])
+        feeds: dict[str, NDArray[np.generic]] = {
+            LEFT: left,
+            RIGHT: _stack([_padded(step.view.right, self._card.stride) for step in steps]),
+            UVD_CURR_FROM_PREV: _stack([step.uvd_curr_from_prev for step in steps]),
+        }
+        for index, tensor in enumerate(self._card.state):
+            nothing = np.zeros(tensor.shape(*left.shape[1:3]), np.float32)
+            feeds[tensor.input_name] = _stack(
+                [nothing if step.state is None else step.state.tensors[index] for step in steps]
+            )
+        return feeds
+
+    def _session(self, iterations: int) -> onnxruntime.InferenceSession:
+        if iterations not in self._sessions:
+            session = onnxruntime.InferenceSession(
+                self._card.graphs[iterations], self._options, providers=self._providers
+            )
+            # onnxruntime falls back to the CPU with a warning; a server must not, unasked.
+            if session.get_providers()[0] != self._providers[0]:
+                raise ProviderUnavailable(
+                    f"{self._providers[0]} is installed but failed to start; onnxruntime's own "
+                    "message above says why (a missing driver or library, most often)"
+                )
+            self._sessions[iterations] = session
+            log.info("loaded %s, %d iterations", self._card.name, iterations)
+        return self._sessions[iterations]
+
+
+def state_bytes(card: ModelCard, height: int, width: int) -> int:
+    """The memory that one stream's state takes."""
+    height, width = (-(-size // card.stride) * card.stride for size in (height, width))
+    return sum(4 * int(np.prod(tensor.shape(height, width))) for tensor in card.state)
+
+
+def packaged_weights_dir() -> Path:
+    """The weights that were installed with the project, found without importing their package.
+
+    Raises FileNotFoundError if they were not.
+    """
+    spec = importlib.util.find_spec("vergence_models")
+    if spec is None or not spec.submodule_search_locations:
+        raise FileNotFoundError("no weights are installed; give a folder that has a manifest.json")
+    return Path(next(iter(spec.submodule_search_locations))) / "weights"
+
+
+def _available(provider: str) -> str:
+    available = onnxruntime.get_available_providers()
+    usable = [name for name, full_name in PROVIDERS.items() if full_name in available]
+    if provider not in usable:
+        raise ProviderUnavailable(
+            f"provider {provider!r} is not available in the installed onnxruntime; "
+            f"it has {', '.join(usable)}"
+        )
+    return PROVIDERS[provider]
+
+
+def _stack(rows: Sequence[NDArray[np.generic]]) -> NDArray[np.generic]:
+    """A batch of rows; a single one is not copied."""
+    return np.ascontiguousarray(rows[0])[None] if len(rows) == 1 else np.stack(rows)
+
+
+def _padded(image: Image, stride: int) -> Image:
+    """Edges repeated to the right and below, where they move no pixel coordinate."""
+    below, right = (-size % stride for size in image.shape[:2])
+    if not (below or right):
+        return image
+    return np.pad(image, ((0, below), (0, right), (0, 0)), mode="edge")

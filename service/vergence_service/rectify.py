@@ -1,0 +1,140 @@
+"""Rectification of a rig as it is, with maps that are made once per stream."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vergence_proto.errors import BadCalibration
+from vergence_proto.geometry import Matrix, Pose, RectifiedRig
+from vergence_proto.types import Distortion, Image, Intrinsics, StereoRig
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Maps:
+    """Where each rectified pixel is in the image as taken, in OpenCV's fixed-point form."""
+
+    whole: NDArray[np.int16]  # [H, W, 2]
+    fraction: NDArray[np.uint16]  # [H, W]
+
+    def remap(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        remapped = cv2.remap(image, self.whole, self.fraction, cv2.INTER_LINEAR)
+        return np.asarray(remapped, np.uint8)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rectifier:
+    """Takes images of a rig to those of its rectification."""
+
+    rig: RectifiedRig
+    left_from_rectified: Pose  # a rotation: the rectified left camera keeps its centre
+    maps: tuple[_Maps, _Maps] | None = None  # None: the rig is rectified already
+    seen: NDArray[np.bool_] | None = None  # [H, W], rectified left pixels that the camera saw
+
+    @classmethod
+    def of(cls, rig: StereoRig) -> Self:
+        """Make the maps, if the rig needs any.
+
+        Raises BadCalibration: the right camera is not to the right, or no view is in common.
+        """
+        rectified = rig.as_rectified()
+        return cls(rectified, Pose.identity()) if rectified else cls._from_cameras(rig)
+
+    @classmethod
+    def _from_cameras(cls, rig: StereoRig) -> Self:
+        fisheye = {
+            camera.distortion is Distortion.KANNALA_BRANDT for camera in (rig.left, rig.right)
+        }
+        if len(fisheye) > 1:
+            raise BadCalibration("expected both cameras to be fisheye or neither, got one of each")
+        projections, rotations = (_fisheye if fisheye.pop() else _pinhole)(rig)
+        (left_k, right_k) = (projection[:, :3] for projection in projections)
+        focal_px = right_k[0, 0]
+        baseline_m = -projections[1][0, 3] / focal_px
+        if not (np.isfinite([left_k, right_k]).all() and focal_px > 0 and left_k[1, 1] > 0):
+            raise BadCalibration(
+                "the rig has no rectification; check distortion and left_from_right"
+            )
+        if not baseline_m > 0:
+            raise BadCalibration(
+                "expected the right camera to the right of the left one (left_from_right with a "
+                f"translation mostly along +x), got {rig.left_from_right.translation_m.tolist()}"
+            )
+        width, height = rig.left.width, rig.left.height
+        rectified = RectifiedRig(
+            width,
+            height,
+            float(left_k[0, 0]),
+            float(left_k[1, 1]),
+            float(left_k[0, 2]),
+            float(right_k[0, 2]),
+            float(left_k[1, 2]),
+            float(baseline_m),
+        )
+        left_maps, right_maps = (
+            _maps(camera, rotation, matrix)
+            for camera, rotation, matrix in zip(
+                (rig.left, rig.right), rotations, (left_k, right_k), strict=True
+            )
+        )
+        seen = left_maps.remap(np.full((height, width), 255, np.uint8)) == 255
+        if not seen.any():
+            raise BadCalibration("no pixel of the rectified left image is seen by the camera")
+        left_from_rectified = Pose(rotations[0].T.copy(), np.zeros(3))
+        return cls(rectified, left_from_rectified, (left_maps, right_maps), seen)
+
+    def rectify(self, left: Image, right: Image) -> tuple[Image, Image]:
+        if self.maps is None:
+            return left, right
+        left_maps, right_maps = self.maps
+        return left_maps.remap(left), right_maps.remap(right)
+
+
+def _pinhole(rig: StereoRig) -> tuple[list[Matrix], list[Matrix]]:
+    right_from_left = rig.left_from_right.inverse()
+    left_rotation, right_rotation, left_projection, right_projection, *_ = cv2.stereoRectify(
+        rig.left.matrix,
+        _coefficients(rig.left),
+        rig.right.matrix,
+        _coefficients(rig.right),
+        (rig.left.width, rig.left.height),
+        right_from_left.rotation,
+        right_from_left.translation_m,
+        flags=cv2.CALIB_ZERO_DISPARITY,
+    )
+    return _float64(left_projection, right_projection), _float64(left_rotation, right_rotation)
+
+
+def _fisheye(rig: StereoRig) -> tuple[list[Matrix], list[Matrix]]:
+    right_from_left = rig.left_from_right.inverse()
+    left_rotation, right_rotation, left_projection, right_projection, _ = cv2.fisheye.stereoRectify(
+        rig.left.matrix,
+        _coefficients(rig.left),
+        rig.right.matrix,
+        _coefficients(rig.right),
+        (rig.left.width, rig.left.height),
+        right_from_left.rotation,
+        right_from_left.translation_m,
+        flags=cv2.CALIB_ZERO_DISPARITY,
+    )
+    return _float64(left_projection, right_projection), _float64(left_rotation, right_rotation)
+
+
+def _maps(camera: Intrinsics, rotation: Matrix, rectified: Matrix) -> _Maps:
+    fisheye = camera.distortion is Distortion.KANNALA_BRANDT
+    make = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
+    size = (camera.width, camera.height)
+    whole, fraction = make(
+        camera.matrix, _coefficients(camera), rotation, rectified, size, cv2.CV_16SC2
+    )
+    return _Maps(np.asarray(whole, np.int16), np.asarray(fraction, np.uint16))
+
+
+def _coefficients(camera: Intrinsics) -> Matrix:
+    return np.array(camera.coefficients or (0.0, 0.0, 0.0, 0.0), np.float64)
+
+
+def _float64(*matrices: object) -> list[Matrix]:
+    return [np.asarray(matrix, np.float64) for matrix in matrices]

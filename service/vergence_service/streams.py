@@ -1,0 +1,311 @@
+"""The open streams: who has them, what they remember, and when they end."""
+
+import asyncio
+import hmac
+import re
+import secrets
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Protocol
+
+import numpy as np
+
+from vergence_proto.errors import (
+    BadCalibration,
+    BadShape,
+    DepthError,
+    FrameOutOfOrder,
+    StateMemory,
+    StreamExists,
+    StreamExpired,
+    StreamLimit,
+    Superseded,
+    UnknownStream,
+)
+from vergence_proto.geometry import Axes
+from vergence_proto.types import Delivery, Origin, OutputFormat, StereoRig
+from vergence_service.continuity import ContinuityLimits, break_between
+from vergence_service.metrics import Metrics
+from vergence_service.model import RecurrentState, View
+from vergence_service.rectify import Rectifier
+
+# How long an expired stream is told apart from one that never was.
+_TOMBSTONE_S = 300.0
+
+_STREAM_ID = re.compile(r"[A-Za-z0-9._-]{1,128}")
+
+
+class NoticeKind(Enum):
+    DRAINING = "draining"
+    EXPIRING = "expiring"
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """Something that will happen to a stream, told before it does."""
+
+    kind: NoticeKind
+    message: str
+    in_s: float
+
+
+class Attachment(Protocol):
+    """The connection that has a stream. Neither method may block or raise."""
+
+    def notify(self, notice: Notice) -> None: ...
+
+    def end(self, error: DepthError) -> None:
+        """The stream is no longer this connection's."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Opening:
+    """How a client wants its stream."""
+
+    rig: StereoRig
+    axes: Axes = Axes.OPENCV
+    delivery: Delivery = Delivery.NEWEST
+    output: OutputFormat = field(default_factory=OutputFormat)
+    iterations: int = 0  # of a warm step; 0: the server's default
+    cold_iterations: int = 0
+
+
+@dataclass(slots=True, eq=False)
+class Stream:
+    """One client's sequence: its rig, its recurrent state, its place in the order of frames."""
+
+    stream_id: str
+    resume_token: bytes
+    opening: Opening
+    rectifier: Rectifier
+    state_bytes: int  # reserved for it
+    attachment: Attachment | None
+    active_s: float  # when it last had a frame, or was attached or detached
+    state: RecurrentState | None = None
+    origin: Origin = Origin.COLD_START  # of the next step, unless its view breaks continuity
+    last_frame_id: int = 0  # the last one stepped
+    frames_stepped: int = 0
+    frames_dropped: int = 0
+    frames_failed: int = 0
+    frames_skipped: int = 0  # not stepped since the last one that was
+    warned: bool = False  # of its expiry
+    turn: asyncio.Lock = field(default_factory=asyncio.Lock)
+
+    def check_order(self, frame_id: int) -> None:
+        if frame_id <= self.last_frame_id:
+            raise FrameOutOfOrder(
+                f"expected a frame_id above {self.last_frame_id}, the last one stepped, "
+                f"got {frame_id}"
+            )
+
+    def state_before(
+        self, view: View, limits: ContinuityLimits
+    ) -> tuple[RecurrentState | None, Origin]:
+        """The state that ``view`` is stepped on, None for a cold start, and why."""
+        if self.state is None:
+            return None, self.origin
+        broken = break_between(self.state, view, limits)
+        return (None, broken) if broken else (self.state, self.origin)
+
+    def commit(self, frame_id: int, state: RecurrentState) -> None:
+        self.state = state
+        self.origin = Origin.WARM
+        self.last_frame_id = frame_id
+        self.frames_stepped += 1
+        self.frames_skipped = 0
+
+    def forget(self, reason: Origin) -> None:
+        """The next step starts from nothing."""
+        self.state = None
+        self.origin = reason
+
+
+class StreamTable:
+    """All streams of one server, within its limits. Time comes from ``clock``, in seconds."""
+
+    def __init__(
+        self,
+        *,
+        capacity: int,
+        max_state_bytes: int,
+        idle_timeout_s: float,
+        idle_notice_s: float,
+        detach_grace_s: float,
+        clock: Callable[[], float],
+        metrics: Metrics,
+    ) -> None:
+        self.capacity = capacity
+        self.idle_timeout_s = idle_timeout_s
+        self.detach_grace_s = detach_grace_s
+        self._max_state_bytes = max_state_bytes
+        self._idle_notice_s = idle_notice_s
+        self._clock = clock
+        self._metrics = metrics
+        self._streams: dict[str, Stream] = {}
+        self._expired_s: dict[str, float] = {}  # tombstones
+
+    def __len__(self) -> int:
+        return len(self._streams)
+
+    def attachments(self) -> Iterable[Attachment]:
+        return [stream.attachment for stream in self._streams.values() if stream.attachment]
+
+    def open(
+        self,
+        stream_id: str,
+        opening: Opening,
+        rectifier: Rectifier,
+        *,
+        state_bytes: int,
+        attachment: Attachment | None,
+    ) -> Stream:
+        """Make a new stream; an empty id lets the server choose one.
+
+        Raises BadShape (the id), StreamExists, StreamLimit, StateMemory.
+        """
+        self.sweep()
+        stream_id = stream_id or f"s-{secrets.token_hex(8)}"
+        if not _STREAM_ID.fullmatch(stream_id):
+            raise BadShape(
+                f"expected a stream id of 1 to 128 characters of A-Z a-z 0-9 . _ -, "
+                f"got {stream_id[:200]!r}"
+            )
+        if stream_id in self._streams:
+            raise StreamExists(
+                f"stream {stream_id!r} is open; resume it with its token, close it, or choose "
+                "another id"
+            )
+        if len(self._streams) >= self.capacity:
+            raise StreamLimit(
+                f"the server holds {self.capacity} streams, as many as it may; close one, or "
+                "try again later",
+                retry_after_s=self._next_expiry_s(),
+            )
+        reserved = self._reserved_bytes()
+        if reserved + state_bytes > self._max_state_bytes:
+            raise StateMemory(
+                f"the stream's state takes {state_bytes} bytes; {reserved} of "
+                f"{self._max_state_bytes} are taken",
+                retry_after_s=self._next_expiry_s(),
+            )
+        self._expired_s.pop(stream_id, None)
+        stream = Stream(
+            stream_id,
+            secrets.token_bytes(16),
+            opening,
+            rectifier,
+            state_bytes,
+            attachment,
+            self._clock(),
+        )
+        self._streams[stream_id] = stream
+        self._count()
+        return stream
+
+    def attach(
+        self, stream_id: str, resume_token: bytes, opening: Opening, attachment: Attachment
+    ) -> Stream:
+        """Give an open stream to a new connection; the newest attachment wins.
+
+        Raises UnknownStream, StreamExpired, StreamExists (the token is not this stream's) and
+        BadCalibration (the rig is not the one it was opened with).
+        """
+        stream = self.get(stream_id)
+        if not hmac.compare_digest(resume_token, stream.resume_token):
+            raise StreamExists(f"stream {stream_id!r} is open and the resume token is not its own")
+        if not _same_rig(stream.opening.rig, opening.rig):
+            raise BadCalibration(
+                f"stream {stream_id!r} was opened with another rig; open a new stream for this one"
+            )
+        if stream.attachment is not None:
+            stream.attachment.end(
+                Superseded(f"a newer connection attached to stream {stream_id!r}")
+            )
+        stream.opening = opening
+        stream.attachment = attachment
+        if stream.state is not None:
+            stream.origin = Origin.RESUMED
+        self.touch(stream)
+        return stream
+
+    def detach(self, stream: Stream, attachment: Attachment) -> None:
+        """A connection is gone; its stream waits for the next one, if it was still its own."""
+        if stream.attachment is attachment:
+            stream.attachment = None
+            self.touch(stream)
+
+    def get(self, stream_id: str) -> Stream:
+        """Raises UnknownStream, or StreamExpired if it was open in the last five minutes."""
+        stream = self._streams.get(stream_id)
+        if stream is not None and self._clock() >= self._expiry_s(stream):
+            self._expire(stream)
+        elif stream is not None:
+            return stream
+        if stream_id in self._expired_s:
+            raise StreamExpired(
+                f"stream {stream_id!r} was left without a connection for {self.detach_grace_s:g} s "
+                f"or without a frame for {self.idle_timeout_s:g} s; open it again"
+            )
+        raise UnknownStream(f"no open stream {stream_id!r}; open it before sending frames")
+
+    def touch(self, stream: Stream) -> None:
+        """The stream is in use: it will not expire for another while."""
+        stream.active_s = self._clock()
+        stream.warned = False
+
+    def close(self, stream: Stream) -> None:
+        """End a stream and free its state, from whichever connection."""
+        if self._streams.get(stream.stream_id) is stream:
+            del self._streams[stream.stream_id]
+            self._count()
+
+    def sweep(self) -> None:
+        """Expire what is due, and warn what will be soon."""
+        now_s = self._clock()
+        for stream in list(self._streams.values()):
+            left_s = self._expiry_s(stream) - now_s
+            if left_s <= 0:
+                self._expire(stream)
+            elif stream.attachment and left_s <= self._idle_notice_s and not stream.warned:
+                stream.warned = True
+                message = f"no frame for {now_s - stream.active_s:.0f} s: the stream will expire"
+                stream.attachment.notify(Notice(NoticeKind.EXPIRING, message, left_s))
+        for stream_id, expired_s in list(self._expired_s.items()):
+            if now_s - expired_s > _TOMBSTONE_S:
+                del self._expired_s[stream_id]
+
+    def idle_s(self, stream: Stream) -> float:
+        return self._clock() - stream.active_s
+
+    def _expire(self, stream: Stream) -> None:
+        self.close(stream)
+        self._expired_s[stream.stream_id] = self._clock()
+        if stream.attachment is not None:
+            stream.attachment.end(
+                StreamExpired(
+                    f"stream {stream.stream_id!r} had no frame for {self.idle_timeout_s:g} s; "
+                    "open it again"
+                )
+            )
+
+    def _expiry_s(self, stream: Stream) -> float:
+        patience_s = self.idle_timeout_s if stream.attachment else self.detach_grace_s
+        return stream.active_s + patience_s
+
+    def _next_expiry_s(self) -> float:
+        return min(map(self._expiry_s, self._streams.values()), default=0.0) - self._clock()
+
+    def _reserved_bytes(self) -> int:
+        return sum(stream.state_bytes for stream in self._streams.values())
+
+    def _count(self) -> None:
+        self._metrics.streams_open.set(len(self._streams))
+        self._metrics.state_bytes.set(self._reserved_bytes())
+
+
+def _same_rig(one: StereoRig, other: StereoRig) -> bool:
+    return (one.left, one.right) == (other.left, other.right) and np.array_equal(
+        one.left_from_right.matrix, other.left_from_right.matrix
+    )
