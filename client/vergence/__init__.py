@@ -1,0 +1,115 @@
+"""Live stereo depth over the network: the client.
+
+::
+
+    import vergence
+
+    # One pair, one line.
+    depth_m = vergence.depth(left, right, rig).depth_m
+
+    # A moving camera: frames and poses in, results as they come.
+    async with vergence.DepthClient("grpc://127.0.0.1:50051") as client:
+        async with client.open_session(rig) as session:
+            session.submit(left, right, world_from_left)
+            async for result in session:
+                print(result.depth_m, result.age_s)
+
+Everything public is in ``__all__``; modules behind it may change. The errors are those of
+:mod:`vergence_proto.errors`, re-exported here.
+"""
+
+from vergence.client import DEFAULT_SERVER, DepthClient
+from vergence.info import ModelInfo, ServerInfo, StreamInfo
+from vergence.results import DepthResult, Drops, EventKind, SessionEvent
+from vergence.session import DepthSession
+from vergence.sync import BlockingClient, BlockingSession, depth
+from vergence.transports.base import ConnectionLost
+from vergence_proto.errors import (
+    BadCalibration,
+    BadImage,
+    BadPose,
+    BadShape,
+    DepthError,
+    Draining,
+    ErrorCode,
+    FrameOutOfOrder,
+    FrameStale,
+    FrameTooLarge,
+    ModelChanged,
+    ModelFailed,
+    NonFinite,
+    NotReady,
+    Quota,
+    StateMemory,
+    StreamExists,
+    StreamExpired,
+    StreamLimit,
+    Superseded,
+    UnknownStream,
+)
+from vergence_proto.geometry import Axes, Pose, RectifiedRig
+from vergence_proto.types import (
+    Delivery,
+    DisparityMap,
+    Distortion,
+    ImageEncoding,
+    Intrinsics,
+    Origin,
+    OutputFormat,
+    PlaneEncoding,
+    PoseSample,
+    StereoRig,
+    Timings,
+)
+
+__all__ = [
+    "DEFAULT_SERVER",
+    "Axes",
+    "BadCalibration",
+    "BadImage",
+    "BadPose",
+    "BadShape",
+    "BlockingClient",
+    "BlockingSession",
+    "ConnectionLost",
+    "Delivery",
+    "DepthClient",
+    "DepthError",
+    "DepthResult",
+    "DepthSession",
+    "DisparityMap",
+    "Distortion",
+    "Draining",
+    "Drops",
+    "ErrorCode",
+    "EventKind",
+    "FrameOutOfOrder",
+    "FrameStale",
+    "FrameTooLarge",
+    "ImageEncoding",
+    "Intrinsics",
+    "ModelChanged",
+    "ModelFailed",
+    "ModelInfo",
+    "NonFinite",
+    "NotReady",
+    "Origin",
+    "OutputFormat",
+    "PlaneEncoding",
+    "Pose",
+    "PoseSample",
+    "Quota",
+    "RectifiedRig",
+    "ServerInfo",
+    "SessionEvent",
+    "StateMemory",
+    "StereoRig",
+    "StreamExists",
+    "StreamExpired",
+    "StreamInfo",
+    "StreamLimit",
+    "Superseded",
+    "Timings",
+    "UnknownStream",
+    "depth",
+]

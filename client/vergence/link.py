@@ -1,0 +1,180 @@
+"""A stream's way to the server: opened, kept alive, and made again when it breaks."""
+
+import asyncio
+import random
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+from vergence.results import EventKind, SessionEvent
+from vergence.transports.base import Call, ConnectionLost, Transport
+from vergence_proto.errors import NotReady
+from vergence_proto.v1 import depth_pb2 as pb
+
+_OPEN_TIMEOUT_S = 5.0
+_CLOSE_TIMEOUT_S = 2.0
+_PING_INTERVAL_S = 1.0
+_FIRST_RETRY_S, _LAST_RETRY_S = 0.05, 1.0
+
+_NOTICES = {
+    pb.NOTICE_KIND_DRAINING: EventKind.DRAINING,
+    pb.NOTICE_KIND_EXPIRING: EventKind.EXPIRING,
+}
+
+
+class LinkUser(Protocol):
+    """What the link tells its session; none of it may block."""
+
+    def attached(self, opened: pb.StreamOpened) -> list[pb.StreamDepthRequest]:
+        """The stream is open, or open again; returns what must be sent again."""
+
+    def detached(self, lost: ConnectionLost) -> None: ...
+
+    def answered(self, response: pb.StreamDepthResponse) -> None: ...
+
+    def ended(self, error: Exception | None) -> None:
+        """Nothing comes any more; with None because the session asked for it."""
+
+
+class Link:
+    """Attach to one stream, and resume it with its token for as long as the server keeps it."""
+
+    def __init__(
+        self,
+        transport: Transport,
+        opening: pb.OpenStream,
+        user: LinkUser,
+        on_event: Callable[[SessionEvent], None] | None,
+    ) -> None:
+        self._transport = transport
+        self._opening = opening
+        self._user = user
+        self._on_event = on_event
+        self._outbox: asyncio.Queue[pb.StreamDepthRequest] = asyncio.Queue()
+        self._ending = False
+        self.up = False
+        self.round_trip_s: float | None = None
+
+    @property
+    def ending(self) -> bool:
+        return self._ending
+
+    async def open(self) -> None:
+        """Attach, and keep at it in the background until :meth:`close`."""
+        call = await self._attach()
+        name = f"vergence stream {self._opening.stream_id}"
+        self._runner = asyncio.create_task(self._run(call), name=name)
+
+    async def close(self) -> None:
+        self.end()
+        await asyncio.wait({self._runner}, timeout=_CLOSE_TIMEOUT_S)
+        self._runner.cancel()
+        await asyncio.gather(self._runner, return_exceptions=True)
+
+    def send(self, request: pb.StreamDepthRequest) -> None:
+        self._outbox.put_nowait(request)
+
+    def end(self) -> None:
+        if not self._ending:
+            self._ending = True
+            self.send(pb.StreamDepthRequest(end=pb.End()))
+
+    async def _run(self, call: Call) -> None:
+        error: Exception | None = ConnectionLost("the session was closed")
+        try:
+            while (lost := await self._converse(call)) is not None:
+                call = await self._resume(lost)
+            error = None
+        except Exception as fatal:  # whatever it is, those who wait for an answer must hear it
+            error = fatal
+        finally:
+            self._ending = True
+            self._user.ended(error)
+
+    async def _converse(self, call: Call) -> ConnectionLost | None:
+        """Send and receive until the call ends: None if that was asked for, else how it broke."""
+        self.up = True
+        helpers = [asyncio.create_task(self._send_all(call)), asyncio.create_task(self._ping())]
+        try:
+            while (response := await call.receive()) is not None:
+                self._take(response)
+        except ConnectionLost as lost:
+            return lost
+        finally:
+            self.up = False
+            for helper in helpers:
+                helper.cancel()
+            await asyncio.gather(*helpers, return_exceptions=True)
+            await call.close()
+        return None if self._ending else ConnectionLost("the server ended the call")
+
+    async def _send_all(self, call: Call) -> None:
+        while True:
+            await call.send(await self._outbox.get())
+
+    async def _ping(self) -> None:
+        while True:
+            self.send(pb.StreamDepthRequest(ping=pb.Ping(client_ns=time.monotonic_ns())))
+            await asyncio.sleep(_PING_INTERVAL_S)
+
+    async def _attach(self) -> Call:
+        call = await self._transport.open_call(self._opening.stream_id)
+        try:
+            async with asyncio.timeout(_OPEN_TIMEOUT_S):
+                await call.send(pb.StreamDepthRequest(open=self._opening))
+                response = await call.receive()
+            if response is None or not response.HasField("opened"):
+                raise NotReady(f"expected the server to open the stream, got {response}")
+            self._opening.resume_token = response.opened.resume_token
+            self._grace_s = response.opened.detach_grace_s
+            again = self._user.attached(response.opened)
+        except TimeoutError:
+            await call.close()
+            raise ConnectionLost(f"the server did not answer in {_OPEN_TIMEOUT_S:g} s") from None
+        except BaseException:
+            await call.close()
+            raise
+        # What was queued for the broken connection is in `again`, or too old to be sent.
+        self._outbox = asyncio.Queue()
+        for request in again:
+            self.send(request)
+        if self._ending:
+            self.send(pb.StreamDepthRequest(end=pb.End()))
+        return call
+
+    async def _resume(self, lost: ConnectionLost) -> Call:
+        self._user.detached(lost)
+        self._tell(SessionEvent(EventKind.DISCONNECTED, str(lost)))
+        started, delay_s = time.monotonic(), _FIRST_RETRY_S
+        while True:
+            try:
+                call = await self._attach()
+            except NotReady as error:
+                if time.monotonic() + delay_s - started > self._grace_s:
+                    raise ConnectionLost(
+                        f"could not reach the server again in {self._grace_s:g} s, after which it "
+                        f"forgets the stream; open a new session ({error})"
+                    ) from error
+            else:
+                away_s = time.monotonic() - started
+                self._tell(SessionEvent(EventKind.RESUMED, f"resumed after {away_s:.2f} s"))
+                return call
+            # Half of it by chance: after an outage not all clients knock at once.
+            await asyncio.sleep(delay_s * random.uniform(0.5, 1.0))
+            delay_s = min(2 * delay_s, _LAST_RETRY_S)
+
+    def _take(self, response: pb.StreamDepthResponse) -> None:
+        match response.WhichOneof("message"):
+            case "pong":
+                pong = response.pong
+                elapsed_ns = time.monotonic_ns() - pong.client_ns - pong.server_hold_ns
+                self.round_trip_s = elapsed_ns * 1e-9
+            case "notice" if response.notice.kind in _NOTICES:
+                notice = response.notice
+                self._tell(SessionEvent(_NOTICES[notice.kind], notice.message, notice.in_s))
+            case _:
+                self._user.answered(response)
+
+    def _tell(self, event: SessionEvent) -> None:
+        if self._on_event is not None:
+            self._on_event(event)

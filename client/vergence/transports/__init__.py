@@ -1,0 +1,1 @@
+"""How messages reach a server. A transport translates, and nothing else."""
