@@ -77,15 +77,26 @@ def image_from_proto(message: pb.Image) -> Image:
         raise BadImage(
             f"the message says {stated[0]}x{stated[1]}, its {name} is {size[0]}x{size[1]}"
         )
+    return decode_image(message.data)
+
+
+def decode_image(data: bytes) -> Image:
+    """Decode a whole image file of any kind OpenCV knows to uint8 [H, W, 3] RGB.
+
+    Raises BadImage: no such file, or one that is cut short or damaged.
+    """
+    if data.startswith(_JPEG_START):
+        size = _jpeg_size(data)
+    elif data.startswith(_PNG_SIGNATURE):
+        size = _png_size(data)
+    else:
+        size = None
     try:
-        decoded = cv2.imdecode(np.frombuffer(message.data, np.uint8), _DECODE_FLAGS)
+        decoded = cv2.imdecode(np.frombuffer(data, np.uint8), _DECODE_FLAGS) if data else None
     except cv2.error as error:
-        raise BadImage(f"the {name} does not decode: {error.err}") from None
-    if decoded is None or decoded.shape != (message.height, message.width, 3):
-        raise BadImage(
-            f"the {name} of {len(message.data)} bytes is damaged: "
-            f"no {message.width}x{message.height} image comes out of it"
-        )
+        raise BadImage(f"the image does not decode: {error.err}") from None
+    if decoded is None or (size and decoded.shape[1::-1] != size):
+        raise BadImage(f"{len(data)} bytes starting {data[:8]!r} are no image, or a damaged one")
     return np.asarray(cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB, dst=decoded), np.uint8)
 
 
