@@ -1,0 +1,1 @@
+"""The science: network, data, training, evaluation, export."""

@@ -1,0 +1,1 @@
+"""Synthetic stereo video with exact ground truth: scenes, rendering, sensor, pools."""

@@ -1,0 +1,306 @@
+"""From shots to clips: poses of every primitive in every view, visibility, colour, ground truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from vergence_models.data import scenes
+from vergence_models.data.clips import StereoClips
+from vergence_models.data.raycast import Cameras, Hits, Primitives, cast, intersect_rays
+from vergence_models.data.scenes import Scene
+from vergence_models.data.shading import FACES, Illumination, shade
+from vergence_models.data.shapes import Shape
+from vergence_models.data.textures import TextureBank
+from vergence_models.data.trajectories import rotation
+
+_SHADOW_RESOLUTION = 256
+# Four samples of an edge pixel, on a rotated grid: nearly vertical and horizontal edges both get
+# four steps of coverage.
+_SAMPLES = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))
+_GAMMA = 1 / 2.2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shot:
+    """A scene and the rectified stereo camera that films it for T frames."""
+
+    scene: Scene
+    world_from_left: NDArray[np.float64]  # [T, 4, 4]
+    times_s: NDArray[np.float64]  # [T]
+    focal_px: float
+    cx: float
+    cy: float
+    baseline_m: float
+
+
+def render(
+    shots: list[Shot], bank: TextureBank, *, width: int, height: int,
+    device: torch.device | str = "cpu",
+) -> StereoClips:  # fmt: skip
+    """Film shots of one length into one batch of clean clips on a device."""
+    count, frames = len(shots), len(shots[0].times_s)
+    world_from_left = torch.from_numpy(np.stack([s.world_from_left for s in shots])).to(device)
+    baseline = _column([s.baseline_m for s in shots], device)
+    world_from_view = _both_eyes(world_from_left, baseline.double())  # [B, T, 2, 4, 4]
+    rows = _padded_rows(shots, device)
+    primitives, table = _in_views(rows, shots, world_from_view)
+
+    def per_view(values: list[float]) -> Tensor:
+        return _column(values, device).repeat_interleave(frames * 2)
+
+    focal = per_view([s.focal_px for s in shots])
+    cx, cy = per_view([s.cx for s in shots]), per_view([s.cy for s in shots])
+    cameras = Cameras(focal, focal, cx, cy, width, height)
+    hits = cast(primitives, cameras)
+    light = _illumination(rows, shots, world_from_view, focal)
+    color = _color(primitives, table, cameras, hits, light, bank)
+    color = color.view(count, frames * 2, height, width, 3)
+    image = _develop(color, shots).view(count, frames, 2, height, width, 3)
+    image = image.permute(0, 1, 2, 5, 3, 4).contiguous()
+
+    disparity = (focal * per_view([s.baseline_m for s in shots]))[:, None, None] / hits.depth_m
+    disparity = disparity.view(count, frames, 2, height, width)
+    first = per_view([s.focal_px for s in shots])[:: frames * 2]
+    return StereoClips(
+        left=image[:, :, 0],
+        right=image[:, :, 1],
+        disparity_px=disparity[:, :, 0].contiguous(),
+        visible=_visible_in_right(disparity[:, :, 0], disparity[:, :, 1]),
+        world_from_left=world_from_left,
+        fx=first,
+        fy=first.clone(),
+        cx=_column([s.cx for s in shots], device),
+        cy=_column([s.cy for s in shots], device),
+        baseline_m=baseline,
+    )
+
+
+def _column(values: list[float], device: torch.device | str) -> Tensor:
+    return torch.tensor(values, dtype=torch.float32, device=device)
+
+
+def _both_eyes(world_from_left: Tensor, baseline_m: Tensor) -> Tensor:
+    left_from_right = torch.eye(4, dtype=torch.float64, device=baseline_m.device)
+    left_from_right = left_from_right.repeat(len(baseline_m), 1, 1, 1)
+    left_from_right[:, 0, 0, 3] = baseline_m
+    return torch.stack([world_from_left, world_from_left @ left_from_right], dim=2)
+
+
+def _padded_rows(shots: list[Shot], device: torch.device | str) -> Tensor:
+    """All scenes as float64 [B, P, COLUMNS], filled up with primitives that nothing hits."""
+    longest = max(len(s.scene.primitives) for s in shots)
+    padded = np.zeros((len(shots), longest, scenes.COLUMNS))
+    padded[:, :, scenes.SHAPE] = Shape.PAD
+    padded[:, :, scenes.HALF_M] = 1
+    padded[:, :, scenes.ROTATION] = np.eye(3).ravel()
+    padded[:, :, scenes.MATERIAL.start + 1] = 1  # span_m is divided by
+    for row, shot in zip(padded, shots, strict=True):
+        row[: len(shot.scene.primitives)] = shot.scene.primitives
+    return torch.from_numpy(padded).to(device)
+
+
+def _in_views(
+    rows: Tensor, shots: list[Shot], world_from_view: Tensor
+) -> tuple[Primitives, Tensor]:
+    """The primitives in the axes of every view, and the table that shading reads, [C, M]."""
+    count, per_view = rows.shape[:2]
+    frames = world_from_view.shape[1]
+    times = torch.from_numpy(np.stack([s.times_s for s in shots])).to(rows.device)
+    center = rows[:, None, :, scenes.CENTER_M] + (
+        times[:, :, None, None] * rows[:, None, :, scenes.VELOCITY_M_S]
+    )
+    turned = rotation((times[:, :, None, None] * rows[:, None, :, scenes.SPIN_RAD_S]).cpu().numpy())
+    start = rows[:, None, :, scenes.ROTATION].reshape(count, 1, per_view, 3, 3)
+    world_from_local = torch.from_numpy(turned).to(rows.device) @ start  # [B, T, P, 3, 3]
+
+    view_from_world = world_from_view.inverse()[:, :, :, None]
+    turn = view_from_world[..., :3, :3] @ world_from_local[:, :, None]
+    shift = view_from_world[..., :3, :3] @ center[:, :, None, :, :, None]
+    shift = shift + view_from_world[..., :3, 3:]
+    half = rows[:, None, None, :, scenes.HALF_M].expand(-1, frames, 2, -1, -1)
+
+    def flat(values: Tensor) -> Tensor:
+        spread = values[:, None, None].expand(-1, frames, 2, *values.shape[1:])
+        return spread.reshape(-1, *values.shape[2:]).float()
+
+    inverse = turn.transpose(-1, -2) / half[..., None]
+    local_from_view = torch.cat([inverse, -inverse @ shift], -1).reshape(-1, 12).t().float()
+    primitives = Primitives(
+        shape=flat(rows[:, :, scenes.SHAPE]).long(),
+        local_from_view=local_from_view.contiguous(),
+        view_from_local=torch.cat([turn * half[..., None, :], shift], -1).view(-1, 3, 4).float(),
+        taper=flat(rows[:, :, scenes.TAPER]),
+        cutout=flat(rows[:, :, scenes.CUTOUT]),
+        views=count * frames * 2,
+    )
+    listed = [scenes.HALF_M, slice(scenes.SHAPE, scenes.SHAPE + 1), scenes.MATERIAL]
+    about = torch.cat([flat(rows[:, :, part]) for part in listed], dim=-1).t()
+    return primitives, torch.cat([local_from_view, about]).contiguous()
+
+
+def _illumination(
+    rows: Tensor, shots: list[Shot], world_from_view: Tensor, focal: Tensor
+) -> Illumination:
+    device = rows.device
+    count, frames = world_from_view.shape[:2]
+    view_from_world = world_from_view.inverse().view(count, frames * 2, 4, 4)
+    shadow, world_from_light, shadow_focal = _shadow_maps(rows, shots)
+
+    def numbers(values: list[NDArray[np.float64]]) -> Tensor:
+        return torch.from_numpy(np.stack(values)).to(device)
+
+    columns = []  # each [B, V per scene, n]
+    for which in range(2):
+        position = numbers([s.scene.lights[which].position_m for s in shots])
+        seen = view_from_world[..., :3, :3] @ position[:, None, :, None]
+        columns.append((seen + view_from_world[..., :3, 3:])[..., 0])
+        color = [
+            np.append(s.scene.lights[which].color, s.scene.lights[which].reach_m ** -2.0)
+            for s in shots
+        ]
+        columns.append(numbers(color)[:, None].expand(-1, frames * 2, -1))
+    columns.append(numbers([s.scene.ambient for s in shots])[:, None].expand(-1, frames * 2, -1))
+    columns.append(-view_from_world[..., :3, 1])  # up is world -y
+    world = world_from_view.view(count, frames * 2, 4, 4)
+    columns.append(world[..., :3, :3].flatten(2))
+    light_from_view = world_from_light.inverse()[:, None] @ world
+    columns.append(light_from_view[..., :3, :].flatten(2))
+    sky = [
+        np.array([shadow_focal[b], s.scene.sky_texture, *s.scene.sky_color])
+        for b, s in enumerate(shots)
+    ]
+    columns.append(numbers(sky)[:, None].expand(-1, frames * 2, -1))
+    columns.append(1 / focal.view(count, -1, 1).double())
+    flat = torch.cat(columns, dim=-1).flatten(0, 1).t().float().contiguous()
+    scene = torch.arange(count, device=device).repeat_interleave(frames * 2)
+    return Illumination(flat, shadow, scene)
+
+
+def _shadow_maps(rows: Tensor, shots: list[Shot]) -> tuple[Tensor, Tensor, list[float]]:
+    """Depth from each scene's first light: maps [B, R, R], world_from_light [B, 4, 4], focals.
+
+    Things that move or glow cast none: the map is drawn once a shot.
+    """
+    resolution, poses, focals = _SHADOW_RESOLUTION, [], []
+    for shot in shots:
+        pose = np.eye(4)
+        position = shot.scene.lights[0].position_m
+        pose[:3, :3] = scenes.look_along(shot.scene.shadow_target_m - position)
+        pose[:3, 3] = position
+        poses.append(pose)
+        focals.append(resolution / 2 / np.tan(shot.scene.shadow_half_angle_rad))
+    world_from_light = torch.from_numpy(np.stack(poses)).to(rows.device)
+    still = rows.clone()
+    moves = (rows[..., scenes.VELOCITY_M_S] != 0).any(-1) | (rows[..., scenes.SPIN_RAD_S] != 0).any(-1)
+    glows = rows[..., scenes.MATERIAL.stop - 1] > 0
+    still[..., scenes.SHAPE] = torch.where(moves | glows, float(Shape.PAD), rows[..., scenes.SHAPE])
+    # A light has one view where the rig has two per frame; its second is dropped again.
+    eyes = world_from_light[:, None, None].expand(-1, 1, 2, -1, -1)
+    both, _ = _in_views(still, [_at_start(s) for s in shots], eyes)
+    keep = torch.arange(both.shape.shape[0], device=rows.device).view(len(shots), 2, -1)[:, 0].flatten()
+    single = Primitives(
+        both.shape[keep], both.local_from_view[:, keep], both.view_from_local[keep],
+        both.taper[keep], both.cutout[keep], len(shots),
+    )  # fmt: skip
+    focal = torch.tensor(focals, dtype=torch.float32, device=rows.device)
+    middle = torch.full_like(focal, (resolution - 1) / 2)
+    cameras = Cameras(focal, focal, middle, middle, resolution, resolution)
+    return cast(single, cameras).depth_m, world_from_light, focals
+
+
+def _at_start(shot: Shot) -> Shot:
+    return Shot(shot.scene, shot.world_from_left[:1], shot.times_s[:1] * 0, shot.focal_px,
+                shot.cx, shot.cy, shot.baseline_m)  # fmt: skip
+
+
+def _color(
+    primitives: Primitives, table: Tensor, cameras: Cameras, hits: Hits, light: Illumination,
+    bank: TextureBank,
+) -> Tensor:  # fmt: skip
+    """Linear RGB [V, H, W, 3]: one sample a pixel, and four where a surface ends."""
+    views, height, width = hits.primitive.shape
+    pixel = torch.arange(views * height * width, device=hits.depth_m.device)
+
+    def rays(at: Tensor, du: float, dv: float) -> tuple[Tensor, Tensor, Tensor]:
+        view = at // (height * width)
+        u, v = at % width + du, at // width % height + dv
+        x = (u - cameras.cx[view]) / cameras.fx[view]
+        return view, x, (v - cameras.cy[view]) / cameras.fy[view]
+
+    view, x, y = rays(pixel, 0.0, 0.0)
+    color, surface = shade(
+        table, light, bank, hits.primitive.flatten(), view, x, y, hits.depth_m.flatten()
+    )
+    around = _neighbours(surface.view(views, height, width))  # [5, V * H * W]
+    edge = (around[1:] != around[:1]).any(0).nonzero()[:, 0]
+    candidates = torch.where(around[:, edge] < 0, -1, around[:, edge] // FACES)
+    sampled = torch.zeros(len(edge), 3, device=color.device)
+    for du, dv in _SAMPLES:
+        view, x, y = rays(edge, du, dv)
+        m, depth = _nearest_of(primitives, candidates, x, y)
+        # Between far surfaces a sample may slip through all candidates: the pixel's own colour.
+        lost = (m < 0) & (candidates >= 0).all(0)
+        extra, _ = shade(table, light, bank, m, view, x, y, depth)
+        sampled += torch.where(lost[:, None], color[edge], extra).clamp(max=2.0)
+    color[edge] = sampled / len(_SAMPLES)
+    return color.view(views, height, width, 3)
+
+
+def _neighbours(surface: Tensor) -> Tensor:
+    """A pixel's own surface and those left, right, above and below it: [5, V * H * W]."""
+    left, right, above, below = (surface.clone() for _ in range(4))
+    left[:, :, 1:], right[:, :, :-1] = surface[:, :, :-1], surface[:, :, 1:]
+    above[:, 1:], below[:, :-1] = surface[:, :-1], surface[:, 1:]
+    return torch.stack([surface, left, right, above, below]).flatten(1)
+
+
+def _nearest_of(
+    primitives: Primitives, candidates: Tensor, x: Tensor, y: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Nearest hit of rays [N] among K candidates each [K, N]: primitive (-1: none) and depth."""
+    depth = torch.full(x.shape, float("inf"), device=x.device)
+    nearest = torch.full_like(candidates[0], -1)
+    for k, candidate in enumerate(candidates):
+        fresh = candidate >= 0
+        for earlier in candidates[:k]:
+            fresh &= candidate != earlier
+        shapes = torch.where(fresh, primitives.shape[candidate.clamp(min=0)], -1)
+        for shape in (Shape.QUAD, Shape.BOX, Shape.ELLIPSOID, Shape.CYLINDER):
+            at = (shapes == shape).nonzero()[:, 0]
+            if len(at):
+                t = intersect_rays(primitives, shape, candidate[at], x[at, None], y[at, None])[:, 0]
+                wins = t < depth[at]
+                depth[at] = torch.where(wins, t, depth[at])
+                nearest[at] = torch.where(wins, candidate[at], nearest[at])
+    return nearest, depth
+
+
+def _develop(color: Tensor, shots: list[Shot]) -> Tensor:
+    """Linear RGB [B, V, H, W, 3] to uint8: one exposure a clip, a soft shoulder, gamma."""
+    brightness = color[:, :1].mean(dim=(1, 2, 3, 4)).clamp(min=1e-3)
+    aim = _column([s.scene.exposure for s in shots], color.device)
+    exposed = color * (aim / brightness)[:, None, None, None, None]
+    # The shoulder maps 4 to 1 and hardly touches what is below one half.
+    rolled = exposed * (1 + exposed / 16) / (1 + exposed)
+    return (rolled.clamp(0, 1).pow(_GAMMA) * 255 + 0.5).to(torch.uint8)
+
+
+def _visible_in_right(left: Tensor, right: Tensor) -> Tensor:
+    """Whether the surface point of each left pixel is seen by the right eye: bool, as `left`.
+
+    Between two neighbouring pixels of the right image a plane's disparity is linear, so a point is
+    hidden only where both of them are nearer than it.
+    """
+    width = left.shape[-1]
+    u = torch.arange(width, device=left.device) - left
+    inside = (u >= 0) & (u <= width - 1)
+    u0 = u.floor().clamp(0, width - 1).long()
+    u1 = (u0 + 1).clamp(max=width - 1)
+    seen = torch.minimum(right.gather(-1, u0), right.gather(-1, u1))
+    slack_px = 0.25  # curved surfaces, and rounding
+    return inside & (seen <= left + slack_px) & (left > 0)

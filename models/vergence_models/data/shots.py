@@ -1,0 +1,72 @@
+"""Draws shots: a camera, a motion, and a room, a street or a swarm of things in front of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vergence_models.data.materials import Palette
+from vergence_models.data.render import Shot
+from vergence_models.data.scenes import Scene
+from vergence_models.data.settings import Viewpoint, room, street, swarm
+from vergence_models.data.trajectories import HeadMotion, rotation
+
+
+@dataclass(frozen=True, slots=True)
+class Mix:
+    """Shares of the kinds of scene; the rest are rooms."""
+
+    streets: float = 0.13
+    swarms: float = 0.2
+
+
+def draw_shot(
+    rng: np.random.Generator, kinds: tuple[str, ...], *, width: int, height: int, frames: int,
+    rate_hz: float, mix: Mix | None = None,
+) -> Shot:  # fmt: skip
+    """Draw everything about one clip. `kinds` names the textures of the bank that renders it."""
+    mix = mix or Mix()
+    palette = Palette(rng, kinds)
+    half_angle = np.radians(rng.uniform(50, 110)) / 2
+    focal_px = width / 2 / np.tan(half_angle)
+    low, high = (0.04, 0.2) if rng.random() < 0.8 else (0.2, 0.5)
+    baseline_m = _log_uniform(rng, low, high)
+    speed = 0.0 if rng.random() < 0.06 else _log_uniform(rng, 0.3, 20)
+    motion = HeadMotion.draw(rng, speed=speed)
+    times_s = np.arange(frames) / rate_hz
+    start_from_left = np.stack([motion.start_from_camera(t) for t in times_s])
+    travel_m = float(np.linalg.norm(start_from_left[:, :3, 3], axis=1).max())
+    turn = np.arccos(np.clip(start_from_left[:, 2, 2], -1, 1)).max()
+
+    largest_px = width * _log_uniform(rng, 0.06, 0.26)
+    world_from_start = np.eye(4)
+    world_from_start[:3, :3] = rotation(rng.normal(0, [0.12, 0.0, 0.06]))
+    view = Viewpoint(
+        half_angle=float(half_angle + 0.5 * turn),
+        aspect=height / width,
+        nearest_m=max(focal_px * baseline_m / largest_px, 0.3) + travel_m,
+        baseline_m=baseline_m,
+    )
+    draw = rng.random()
+    scene: Scene
+    if draw < mix.streets:
+        scene, camera_height_m = street(rng, palette, view)
+    elif draw < mix.streets + mix.swarms:
+        scene, camera_height_m = swarm(rng, palette, view)
+    else:
+        scene, camera_height_m = room(rng, palette, view)
+    world_from_start[1, 3] = -camera_height_m
+    return Shot(
+        scene=scene,
+        world_from_left=world_from_start @ start_from_left,
+        times_s=times_s,
+        focal_px=float(focal_px),
+        cx=(width - 1) / 2 + float(rng.normal(0, 0.01)) * width,
+        cy=(height - 1) / 2 + float(rng.normal(0, 0.01)) * height,
+        baseline_m=float(baseline_m),
+    )
+
+
+def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
