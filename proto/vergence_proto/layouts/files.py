@@ -1,0 +1,57 @@
+"""Small files read with care, and the one error of every reader."""
+
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class LayoutError(ValueError):
+    """A file is missing, damaged, or not what its layout says; the message names it."""
+
+
+def existing(path: Path, purpose: str) -> Path:
+    """Raises LayoutError: there is no such file."""
+    if not path.is_file():
+        raise LayoutError(f"{path}: not found; expected {purpose}")
+    return path
+
+
+def read_text(path: Path, purpose: str) -> str:
+    """Raises LayoutError: there is no such file, or it is not text."""
+    try:
+        return existing(path, purpose).read_text("utf-8")
+    except UnicodeDecodeError:
+        raise LayoutError(f"{path}: expected text, {purpose}") from None
+
+
+def numbers(words: str, count: int | None, origin: str) -> list[float]:
+    """Parse numbers split by blanks or commas.
+
+    Raises LayoutError: a word that is no number, or another count than ``count``.
+    """
+    try:
+        parsed = [float(word) for word in words.replace(",", " ").split()]
+    except ValueError as error:
+        raise LayoutError(f"{origin}: {error}") from None
+    if count is not None and len(parsed) != count:
+        raise LayoutError(f"{origin}: expected {count} numbers, got {len(parsed)}")
+    return parsed
+
+
+def npz_arrays(path: Path, *names: str) -> Mapping[str, NDArray[Any]]:
+    """Read a whole .npz. Raises LayoutError: damaged, or without one of ``names``."""
+    existing(path, "an .npz")
+    try:
+        with np.load(path) as file:
+            arrays = dict(file)
+    except (ValueError, EOFError, OSError, zipfile.BadZipFile, zlib.error) as error:
+        raise LayoutError(f"{path}: no readable .npz: {error}") from None
+    for name in names:
+        if name not in arrays:
+            raise LayoutError(f"{path}: expected an array {name!r}, got {', '.join(arrays)}")
+    return arrays
