@@ -14,6 +14,7 @@ from vergence_proto.errors import (
     FrameTooLarge,
     NonFinite,
     NotReady,
+    UnknownStream,
 )
 from vergence_proto.geometry import Pose
 from vergence_proto.model_io import ModelCard
@@ -60,6 +61,11 @@ class DepthEngine:
         self._refusal: DepthError | None = NotReady(
             "the model is loading; try again", retry_after_s=1.0
         )
+
+    @property
+    def ready(self) -> bool:
+        """New streams are taken."""
+        return self._refusal is None
 
     async def start(self) -> None:
         """Load the model; until it is done every opening is refused with NotReady."""
@@ -122,7 +128,9 @@ class DepthEngine:
             try:
                 answer = await self._advance(stream, decode, arrived_s, max_age_s)
             except DepthError as error:
-                self._count_failure(stream, error)
+                self.count_failed(stream, error)
+                if isinstance(error, NonFinite):
+                    stream.forget(Origin.RESET_NON_FINITE)
                 raise
         return await asyncio.to_thread(answer.disparity_map)
 
@@ -138,11 +146,21 @@ class DepthEngine:
         stream.frames_skipped += 1
         self.metrics.frames_dropped.inc()
 
-    def close(self, stream_id: str) -> Stream:
-        """End a stream and free its state. Raises UnknownStream, StreamExpired."""
+    def count_failed(self, stream: Stream, error: DepthError) -> None:
+        """A frame of the stream was answered with an error."""
+        stream.frames_failed += 1
+        stream.frames_skipped += 1
+        self.metrics.frames_failed.labels(error.code).inc()
+
+    def close(self, stream_id: str) -> None:
+        """End a stream and free its state, whichever connection asks.
+
+        Raises UnknownStream, StreamExpired.
+        """
         stream = self.streams.get(stream_id)
         self.streams.close(stream)
-        return stream
+        if stream.attachment is not None:
+            stream.attachment.end(UnknownStream(f"stream {stream_id!r} was closed"))
 
     async def _advance(
         self,
@@ -180,13 +198,6 @@ class DepthEngine:
             else opening.iterations or self._iterations
         )
         return self.card.iterations_at_most(wanted)
-
-    def _count_failure(self, stream: Stream, error: DepthError) -> None:
-        stream.frames_failed += 1
-        stream.frames_skipped += 1
-        self.metrics.frames_failed.labels(error.code).inc()
-        if isinstance(error, NonFinite):
-            stream.forget(Origin.RESET_NON_FINITE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,0 +1,146 @@
+"""The composition root: settings in, a running server out."""
+
+import asyncio
+import signal
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+
+from prometheus_client import CollectorRegistry
+
+from vergence_service.batcher import StepBatcher
+from vergence_service.continuity import ContinuityLimits
+from vergence_service.engine import DepthEngine
+from vergence_service.metrics import Metrics
+from vergence_service.model import OnnxStereoModel, StereoModel, packaged_weights_dir
+from vergence_service.settings import Settings
+from vergence_service.streams import StreamTable
+from vergence_service.transports.grpc_server import DepthServicer, GrpcServer
+from vergence_service.transports.grpc_stream import StreamLimits
+from vergence_service.transports.http_app import HttpServer, make_http_app
+
+_MIB = 1 << 20
+_SWEEP_EVERY_S = 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Running:
+    """A server that serves."""
+
+    grpc_address: str
+    http_address: str
+    engine: DepthEngine
+    grpc: GrpcServer
+
+
+def make_model(settings: Settings) -> OnnxStereoModel:
+    """Raises ManifestError, ProviderUnavailable, FileNotFoundError: no such weights here."""
+    return OnnxStereoModel(
+        settings.model.weights or packaged_weights_dir(),
+        settings.model.name,
+        providers=settings.model.providers,
+        threads=settings.model.threads,
+        allow_spinning=settings.model.allow_spinning,
+    )
+
+
+@asynccontextmanager
+async def running(
+    settings: Settings, model: StereoModel, *, clock: Callable[[], float] = time.monotonic
+) -> AsyncIterator[Running]:
+    """A server from its first listening socket to its last; inside the block it serves.
+
+    Raises PortTaken, and what the model raises when it loads.
+    """
+    registry = CollectorRegistry()
+    metrics = Metrics(registry)
+    streams = StreamTable(
+        capacity=settings.streams.capacity,
+        max_state_bytes=settings.streams.max_state_mib * _MIB,
+        idle_timeout_s=settings.streams.idle_timeout_s,
+        idle_notice_s=settings.streams.idle_notice_s,
+        detach_grace_s=settings.streams.detach_grace_s,
+        clock=clock,
+        metrics=metrics,
+    )
+    batcher = StepBatcher(model, max_batch=settings.model.max_batch, clock=clock, metrics=metrics)
+    engine = DepthEngine(
+        streams,
+        batcher,
+        card=model.card,
+        iterations=settings.model.iterations,
+        cold_iterations=settings.model.cold_iterations,
+        limits=ContinuityLimits(**settings.continuity.model_dump()),
+        max_pixels=settings.streams.max_pixels,
+        clock=clock,
+        metrics=metrics,
+    )
+    max_frame_bytes = settings.grpc.max_frame_mib * _MIB
+    servicer = DepthServicer(
+        engine,
+        provider=model.provider,
+        limits=StreamLimits(
+            credit=settings.grpc.credit,
+            waiting_frames=settings.grpc.waiting_frames,
+            max_frame_bytes=max_frame_bytes,
+        ),
+        clock=clock,
+    )
+    # Outermost ends last: no transport outlives the batcher that it feeds.
+    async with (
+        batcher,
+        GrpcServer(
+            servicer,
+            host=settings.grpc.host,
+            port=settings.grpc.port,
+            max_frame_bytes=max_frame_bytes,
+        ) as grpc_server,
+        HttpServer(
+            make_http_app(ready=lambda: engine.ready, registry=registry),
+            host=settings.http.host,
+            port=settings.http.port,
+        ) as http_server,
+        _sweeping(streams),
+    ):
+        await engine.start()
+        await grpc_server.serving()
+        yield Running(
+            f"{settings.grpc.host}:{grpc_server.port}",
+            f"{settings.http.host}:{http_server.port}",
+            engine,
+            grpc_server,
+        )
+
+
+async def serve(settings: Settings, *, on_serving: Callable[[Running], None]) -> None:
+    """Serve until SIGTERM or SIGINT, then drain. Raises as make_model and running."""
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop.set)
+    async with running(settings, make_model(settings)) as server:
+        on_serving(server)
+        await stop.wait()
+        await drain(server, within_s=settings.grpc.drain_s)
+
+
+async def drain(server: Running, *, within_s: float) -> None:
+    """Tell clients, let them leave, answer what they have sent; within twice the time given."""
+    server.engine.drain(within_s=within_s)
+    await server.grpc.drain(within_s=within_s)
+
+
+@asynccontextmanager
+async def _sweeping(streams: StreamTable) -> AsyncIterator[None]:
+    async def sweep() -> None:
+        while True:
+            await asyncio.sleep(_SWEEP_EVERY_S)
+            streams.sweep()
+
+    task = asyncio.create_task(sweep(), name="sweep")
+    try:
+        yield
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)

@@ -1,0 +1,75 @@
+"""DepthError to gRPC: a status, and google.rpc.ErrorInfo for programs."""
+
+import logging
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
+from typing import Any
+
+import grpc
+from google.protobuf.any_pb2 import Any as AnyProto
+from google.protobuf.duration_pb2 import Duration
+from google.protobuf.message import Message
+from google.rpc import error_details_pb2, status_pb2
+from grpc_status import rpc_status
+
+from vergence_proto.errors import ERROR_DOMAIN, DepthError, ErrorCode, ModelFailed
+
+log = logging.getLogger(__name__)
+
+# Requests and responses differ from call to call; nothing here looks at them.
+Context = grpc.aio.ServicerContext[Any, Any]
+
+GRPC_STATUS: Mapping[ErrorCode, grpc.StatusCode] = {
+    ErrorCode.BAD_IMAGE: grpc.StatusCode.INVALID_ARGUMENT,
+    ErrorCode.BAD_POSE: grpc.StatusCode.INVALID_ARGUMENT,
+    ErrorCode.BAD_SHAPE: grpc.StatusCode.INVALID_ARGUMENT,
+    ErrorCode.BAD_CALIBRATION: grpc.StatusCode.INVALID_ARGUMENT,
+    ErrorCode.STREAM_UNKNOWN: grpc.StatusCode.NOT_FOUND,
+    ErrorCode.STREAM_EXPIRED: grpc.StatusCode.NOT_FOUND,
+    ErrorCode.STREAM_EXISTS: grpc.StatusCode.ALREADY_EXISTS,
+    ErrorCode.SUPERSEDED: grpc.StatusCode.ABORTED,
+    ErrorCode.FRAME_OUT_OF_ORDER: grpc.StatusCode.FAILED_PRECONDITION,
+    ErrorCode.MODEL_CHANGED: grpc.StatusCode.FAILED_PRECONDITION,
+    ErrorCode.STREAM_LIMIT: grpc.StatusCode.RESOURCE_EXHAUSTED,
+    ErrorCode.STATE_MEMORY: grpc.StatusCode.RESOURCE_EXHAUSTED,
+    ErrorCode.QUOTA: grpc.StatusCode.RESOURCE_EXHAUSTED,
+    ErrorCode.FRAME_TOO_LARGE: grpc.StatusCode.RESOURCE_EXHAUSTED,
+    ErrorCode.FRAME_STALE: grpc.StatusCode.DEADLINE_EXCEEDED,
+    ErrorCode.DRAINING: grpc.StatusCode.UNAVAILABLE,
+    ErrorCode.NOT_READY: grpc.StatusCode.UNAVAILABLE,
+    ErrorCode.MODEL_FAILED: grpc.StatusCode.INTERNAL,
+    ErrorCode.NON_FINITE: grpc.StatusCode.INTERNAL,
+}
+
+
+async def abort(context: Context, error: DepthError) -> None:
+    """End the call with the error. Does not return."""
+    details: list[Message] = [
+        error_details_pb2.ErrorInfo(reason=error.code, domain=ERROR_DOMAIN),
+    ]
+    if error.retry_after_s is not None:
+        delay = Duration()
+        delay.FromNanoseconds(int(error.retry_after_s * 1e9))
+        details.append(error_details_pb2.RetryInfo(retry_delay=delay))
+    code = GRPC_STATUS[error.code]
+    status = status_pb2.Status(code=code.value[0], message=str(error))
+    for detail in details:
+        packed = AnyProto()
+        packed.Pack(detail)
+        status.details.append(packed)
+    trailing_metadata = rpc_status.to_status(status).trailing_metadata
+    await context.abort(code, str(error), trailing_metadata)
+
+
+@asynccontextmanager
+async def errors_as_status(context: Context) -> AsyncIterator[None]:
+    """End the call with whatever DepthError the block raises; anything else is told as INTERNAL."""
+    try:
+        yield
+    except DepthError as error:
+        await abort(context, error)
+    except (grpc.aio.AbortError, grpc.aio.UsageError):
+        raise
+    except Exception:
+        log.exception("a call failed in a way that nobody foresaw")
+        await abort(context, ModelFailed("the server failed; its log says why"))

@@ -1,0 +1,177 @@
+"""vergence.v1.DepthService over grpc.aio, with the standard health and reflection services."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from importlib.metadata import version
+from typing import Self
+
+import grpc
+from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection
+
+from vergence_proto import codec
+from vergence_proto.errors import Draining
+from vergence_proto.v1 import depth_pb2 as pb
+from vergence_proto.v1 import depth_pb2_grpc
+from vergence_service.engine import DepthEngine
+from vergence_service.transports import PortTaken
+from vergence_service.transports.grpc_errors import Context, errors_as_status
+from vergence_service.transports.grpc_stream import DepthCall, StreamLimits, model_info
+
+_SERVICE = pb.DESCRIPTOR.services_by_name["DepthService"].full_name
+
+# A frame just over the limit is still received, so that the refusal can say what the limit is.
+_ROOM_OVER_THE_LIMIT = 1.25
+
+# A headset that vanished is noticed within fifteen seconds, not gRPC's two hours; clients may ask
+# as often as every five.
+_KEEPALIVE = (
+    ("grpc.keepalive_time_ms", 10_000),
+    ("grpc.keepalive_timeout_ms", 5_000),
+    ("grpc.keepalive_permit_without_calls", 1),
+    ("grpc.http2.min_recv_ping_interval_without_data_ms", 4_000),
+)
+
+
+class DepthServicer(depth_pb2_grpc.DepthServiceServicer):
+    """Translates each call to the engine's words."""
+
+    def __init__(
+        self,
+        engine: DepthEngine,
+        *,
+        provider: str,
+        limits: StreamLimits,
+        clock: Callable[[], float],
+    ) -> None:
+        self._engine = engine
+        self._provider = provider
+        self._limits = limits
+        self._clock = clock
+        self.calls: set[DepthCall] = set()
+        self.idle = asyncio.Event()  # no call is open
+        self.idle.set()
+
+    async def StreamDepth(  # noqa: N802 -- the wire's name
+        self, request_iterator: AsyncIterator[pb.StreamDepthRequest], context: Context
+    ) -> None:
+        call = DepthCall(
+            self._engine, request_iterator, context.write, limits=self._limits, clock=self._clock
+        )
+        self.calls.add(call)
+        self.idle.clear()
+        try:
+            async with errors_as_status(context):
+                await call.run()
+        finally:
+            self.calls.discard(call)
+            if not self.calls:
+                self.idle.set()
+
+    async def GetServerInfo(  # noqa: N802
+        self, request: pb.GetServerInfoRequest, context: Context
+    ) -> pb.GetServerInfoResponse:
+        return pb.GetServerInfoResponse(
+            version=version("vergence"),
+            model=model_info(self._engine.card),
+            provider=self._provider,
+            streams_open=len(self._engine.streams),
+            streams_max=self._engine.streams.capacity,
+            max_message_bytes=self._limits.max_frame_bytes,
+            max_pixels=self._engine.max_pixels,
+        )
+
+    async def GetStream(  # noqa: N802
+        self, request: pb.GetStreamRequest, context: Context
+    ) -> pb.GetStreamResponse:
+        async with errors_as_status(context):
+            stream = self._engine.streams.get(request.stream_id)
+            return pb.GetStreamResponse(
+                stream_id=stream.stream_id,
+                attached=stream.attachment is not None,
+                rig=codec.rectified_rig_to_proto(stream.rectifier.rig),
+                frames_stepped=stream.frames_stepped,
+                frames_dropped=stream.frames_dropped,
+                frames_failed=stream.frames_failed,
+                last_frame_id=stream.last_frame_id,
+                step_count=stream.state.step_count if stream.state else 0,
+                idle_s=self._engine.streams.idle_s(stream),
+                state_bytes=stream.state.nbytes if stream.state else 0,
+            )
+
+    async def ResetStream(  # noqa: N802
+        self, request: pb.ResetStreamRequest, context: Context
+    ) -> pb.ResetStreamResponse:
+        async with errors_as_status(context):
+            await self._engine.reset(request.stream_id)
+        return pb.ResetStreamResponse()
+
+    async def CloseStream(  # noqa: N802
+        self, request: pb.CloseStreamRequest, context: Context
+    ) -> pb.CloseStreamResponse:
+        async with errors_as_status(context):
+            self._engine.close(request.stream_id)
+        return pb.CloseStreamResponse()
+
+
+class GrpcServer:
+    """Listens from construction of its context to its end; serves once told to.
+
+    Raises PortTaken.
+    """
+
+    def __init__(
+        self, servicer: DepthServicer, *, host: str, port: int, max_frame_bytes: int
+    ) -> None:
+        self._servicer = servicer
+        self._address = f"{host}:{port}"
+        self._max_message_bytes = int(max_frame_bytes * _ROOM_OVER_THE_LIMIT)
+        self._health = health.aio.HealthServicer()  # type: ignore[attr-defined] # bound at import
+        self.port = port
+
+    async def __aenter__(self) -> Self:
+        self._server = grpc.aio.server(
+            options=[
+                # On by default, two servers would share the port and split streams silently.
+                ("grpc.so_reuseport", 0),
+                ("grpc.max_receive_message_length", self._max_message_bytes),
+                ("grpc.max_send_message_length", self._max_message_bytes),
+                *_KEEPALIVE,
+            ]
+        )
+        depth_pb2_grpc.add_DepthServiceServicer_to_server(  # type: ignore[no-untyped-call]
+            self._servicer, self._server
+        )
+        health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
+        reflection.enable_server_reflection(
+            [_SERVICE, health.SERVICE_NAME, reflection.SERVICE_NAME], self._server
+        )
+        await self._tell_health(health_pb2.HealthCheckResponse.NOT_SERVING)
+        try:
+            self.port = self._server.add_insecure_port(self._address)
+        except RuntimeError:
+            raise PortTaken(self._address, "grpc.port") from None
+        await self._server.start()
+        return self
+
+    async def __aexit__(self, *exc_info: object) -> None:
+        await self._server.stop(grace=None)
+
+    async def serving(self) -> None:
+        """Tell those that watch the health service that calls are welcome."""
+        await self._tell_health(health_pb2.HealthCheckResponse.SERVING)
+
+    async def drain(self, *, within_s: float) -> None:
+        """Let calls end by themselves, then answer what they have sent and end them."""
+        await self._tell_health(health_pb2.HealthCheckResponse.NOT_SERVING)
+        try:
+            async with asyncio.timeout(within_s):
+                await self._servicer.idle.wait()
+        except TimeoutError:
+            for call in self._servicer.calls:
+                call.finish(Draining("the server is shutting down; continue on another one"))
+        await self._server.stop(grace=within_s)
+
+    async def _tell_health(self, status: health_pb2.HealthCheckResponse.ServingStatus) -> None:
+        for service in ("", _SERVICE):
+            await self._health.set(service, status)

@@ -1,0 +1,240 @@
+"""One StreamDepth call: a reader, a stepper and a writer, so that they overlap."""
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable
+from dataclasses import dataclass
+from functools import partial
+
+from vergence_proto import codec
+from vergence_proto.errors import BadShape, DepthError, FrameTooLarge, StreamExists, UnknownStream
+from vergence_proto.model_io import ModelCard
+from vergence_proto.types import DisparityMap
+from vergence_proto.v1 import depth_pb2 as pb
+from vergence_service.engine import DepthEngine
+from vergence_service.streams import Notice, NoticeKind, Opening, Stream
+from vergence_service.transports.mailbox import Letter, Mailbox
+
+# One map is encoded and sent while the next is stepped. Past it the stepper waits for the client
+# to read, and newer frames displace older ones in the mailbox.
+_UNSENT_MAPS = 2
+# Short answers to a client that does not read; past it its frames are not read either.
+_OUTBOX = 64
+
+_NOTICE = {
+    NoticeKind.DRAINING: pb.NOTICE_KIND_DRAINING,
+    NoticeKind.EXPIRING: pb.NOTICE_KIND_EXPIRING,
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamLimits:
+    credit: int  # frames that a client may have unanswered
+    waiting_frames: int  # of a lossless stream, before the sender waits
+    max_frame_bytes: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Map:
+    disparity: DisparityMap
+    arrived_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Ping:
+    client_ns: int
+    arrived_s: float
+
+
+class DepthCall:
+    """One connection to one stream: the stream's attachment."""
+
+    def __init__(
+        self,
+        engine: DepthEngine,
+        requests: AsyncIterator[pb.StreamDepthRequest],
+        write: Callable[[pb.StreamDepthResponse], Awaitable[None]],
+        *,
+        limits: StreamLimits,
+        clock: Callable[[], float],
+    ) -> None:
+        self._engine = engine
+        self._requests = requests
+        self._write = write
+        self._limits = limits
+        self._clock = clock
+        self._outbox: asyncio.Queue[pb.StreamDepthResponse | _Map | _Ping | None]
+        self._outbox = asyncio.Queue(_OUTBOX)
+        self._unsent = asyncio.Semaphore(_UNSENT_MAPS)
+        self._reader: asyncio.Task[None] | None = None
+        self._stepper: asyncio.Task[None] | None = None
+        self._error: DepthError | None = None  # what the call ends with
+        self._client_is_done = False
+
+    def notify(self, notice: Notice) -> None:
+        message = pb.Notice(kind=_NOTICE[notice.kind], message=notice.message, in_s=notice.in_s)
+        if not self._outbox.full():  # a client that does not read will not read this either
+            self._outbox.put_nowait(pb.StreamDepthResponse(notice=message))
+
+    def end(self, error: DepthError) -> None:
+        """Stop reading and stepping at once, send what is ready, and end with the error."""
+        self.finish(error)
+        if self._stepper is not None:
+            self._stepper.cancel()
+
+    def finish(self, error: DepthError) -> None:
+        """Stop reading, answer what has arrived, and end with the error."""
+        self._error = self._error or error
+        if self._reader is not None:
+            self._reader.cancel()
+
+    async def run(self) -> None:
+        """Serve the call to its end. Raises the DepthError that it ends with, if any."""
+        stream, resumed = await self._open()
+        try:
+            await self._write(pb.StreamDepthResponse(opened=self._opened(stream, resumed)))
+            if self._error is None:
+                await self._serve(stream)
+        finally:
+            self._engine.streams.detach(stream, self)
+        if self._error is not None:
+            raise self._error
+        if self._client_is_done:
+            self._engine.close(stream.stream_id)
+
+    async def _serve(self, stream: Stream) -> None:
+        mailbox: Mailbox[pb.Frame]
+        mailbox = Mailbox(stream.opening.delivery, capacity=self._limits.waiting_frames)
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._send_answers(stream))
+            self._reader = tasks.create_task(self._read(stream, mailbox))
+            self._stepper = tasks.create_task(self._step(stream, mailbox))
+            await asyncio.wait([self._reader, self._stepper])
+            await self._outbox.put(None)
+
+    async def _open(self) -> tuple[Stream, bool]:
+        first = await anext(aiter(self._requests), None)
+        if first is None or not first.HasField("open"):
+            raise UnknownStream("the first message of a call must open or resume a stream")
+        request = first.open
+        opening = Opening(
+            rig=codec.rig_from_proto(request.rig),
+            axes=codec.axes_from_proto(request.axes),
+            delivery=codec.delivery_from_proto(request.delivery),
+            output=codec.output_format_from_proto(request.output),
+            iterations=request.iterations,
+            cold_iterations=request.cold_iterations,
+        )
+        if request.resume_token:
+            token = request.resume_token
+            return self._engine.resume(request.stream_id, token, opening, self), True
+        return await self._engine.open(request.stream_id, opening, self), False
+
+    def _opened(self, stream: Stream, resumed: bool) -> pb.StreamOpened:
+        return pb.StreamOpened(
+            stream_id=stream.stream_id,
+            resume_token=stream.resume_token,
+            credit=self._limits.credit,
+            rig=codec.rectified_rig_to_proto(stream.rectifier.rig),
+            model=model_info(self._engine.card),
+            resumed=resumed,
+            detach_grace_s=self._engine.streams.detach_grace_s,
+            idle_timeout_s=self._engine.streams.idle_timeout_s,
+            last_frame_id=stream.last_frame_id,
+        )
+
+    async def _read(self, stream: Stream, mailbox: Mailbox[pb.Frame]) -> None:
+        try:
+            async for request in self._requests:
+                arrived_s = self._clock()
+                match request.WhichOneof("message"):
+                    case "frame":
+                        await self._receive(stream, mailbox, request.frame, arrived_s)
+                    case "ping":
+                        await self._outbox.put(_Ping(request.ping.client_ns, arrived_s))
+                    case "reset":
+                        mailbox.reset()
+                    case "end":
+                        self._client_is_done = True
+                        return
+                    case "open":
+                        self.end(StreamExists("this call has opened its stream already"))
+                    case None:
+                        self.end(BadShape("expected one of the messages of depth.proto, got none"))
+        finally:
+            await mailbox.finish()
+
+    async def _receive(
+        self, stream: Stream, mailbox: Mailbox[pb.Frame], frame: pb.Frame, arrived_s: float
+    ) -> None:
+        try:
+            if (size := frame.ByteSize()) > self._limits.max_frame_bytes:
+                raise FrameTooLarge(
+                    f"expected a frame of at most {self._limits.max_frame_bytes} bytes, got {size}"
+                )
+            displaced = await mailbox.put(Letter(frame.frame_id, frame, arrived_s))
+        except DepthError as error:
+            self._engine.count_failed(stream, error)
+            await self._refuse(frame.frame_id, error)
+            return
+        if displaced is not None:
+            self._engine.count_dropped(stream)
+            dropped = pb.FramesDropped(frame_ids=[displaced.frame_id])
+            await self._outbox.put(pb.StreamDepthResponse(frames_dropped=dropped))
+
+    async def _step(self, stream: Stream, mailbox: Mailbox[pb.Frame]) -> None:
+        while True:
+            await self._unsent.acquire()
+            letter = await mailbox.take()
+            if letter is None:
+                return
+            frame = letter.content
+            try:
+                if letter.reset_before:
+                    await self._engine.reset(stream.stream_id)
+                disparity = await self._engine.step(
+                    stream.stream_id,
+                    partial(codec.frame_from_proto, frame),
+                    arrived_s=letter.arrived_s,
+                    max_age_s=frame.max_age_s if frame.HasField("max_age_s") else None,
+                )
+            except DepthError as error:
+                self._unsent.release()
+                await self._refuse(letter.frame_id, error)
+            else:
+                await self._outbox.put(_Map(disparity, letter.arrived_s))
+
+    async def _refuse(self, frame_id: int, error: DepthError) -> None:
+        message = codec.error_to_frame_error(frame_id, error)
+        await self._outbox.put(pb.StreamDepthResponse(frame_error=message))
+
+    async def _send_answers(self, stream: Stream) -> None:
+        while (answer := await self._outbox.get()) is not None:
+            match answer:
+                case _Map():
+                    await self._write(await asyncio.to_thread(self._encoded, answer, stream))
+                    self._unsent.release()
+                case _Ping(client_ns, arrived_s):
+                    hold_ns = int((self._clock() - arrived_s) * 1e9)
+                    pong = pb.Pong(client_ns=client_ns, server_hold_ns=hold_ns)
+                    await self._write(pb.StreamDepthResponse(pong=pong))
+                case _:
+                    await self._write(answer)
+
+    def _encoded(self, answer: _Map, stream: Stream) -> pb.StreamDepthResponse:
+        started_s = self._clock()
+        message = codec.disparity_to_proto(answer.disparity, stream.opening.output)
+        done_s = self._clock()
+        message.timings.encode_us = round((done_s - started_s) * 1e6)
+        message.timings.total_us = round((done_s - answer.arrived_s) * 1e6)
+        self._engine.metrics.stage_s.labels("encode").observe(done_s - started_s)
+        self._engine.metrics.stage_s.labels("total").observe(done_s - answer.arrived_s)
+        return pb.StreamDepthResponse(disparity=message)
+
+
+def model_info(card: ModelCard) -> pb.ModelInfo:
+    return pb.ModelInfo(
+        name=card.name,
+        weights_sha256=card.weights_sha256,
+        iterations=sorted(card.graphs),
+        max_disparity_px=card.max_disparity_px,
+    )
