@@ -23,6 +23,7 @@ _SHADOW_RESOLUTION = 256
 # four steps of coverage.
 _SAMPLES = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))
 _GAMMA = 1 / 2.2
+_BRIGHTEST = 2.0  # a highlight brighter than this would swallow the edge it is on
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -239,14 +240,16 @@ def _color(
     around = _neighbours(surface.view(views, height, width))  # [5, V * H * W]
     edge = (around[1:] != around[:1]).any(0).nonzero()[:, 0]
     candidates = torch.where(around[:, edge] < 0, -1, around[:, edge] // FACES)
+    # A sample takes the colour of the nearest pixel that shows its surface: visibility is sampled
+    # four times, but shading, which textures have filtered already, is done once a pixel.
+    places = torch.stack([edge + step for step in (0, -1, 1, -width, width)])
+    own = color.clamp(max=_BRIGHTEST)
+    nearby = own[places.clamp(0, len(own) - 1)]  # [5, N, 3]
     sampled = torch.zeros(len(edge), 3, device=color.device)
     for du, dv in _SAMPLES:
-        view, x, y = rays(edge, du, dv)
-        m, depth = _nearest_of(primitives, candidates, x, y)
-        # Between far surfaces a sample may slip through all candidates: the pixel's own colour.
-        lost = (m < 0) & (candidates >= 0).all(0)
-        extra, _ = shade(table, light, bank, m, view, x, y, depth)
-        sampled += torch.where(lost[:, None], color[edge], extra).clamp(max=2.0)
+        _, x, y = rays(edge, du, dv)
+        source = _nearest_of(primitives, candidates, x, y)
+        sampled += nearby.gather(0, source[None, :, None].expand(1, -1, 3))[0]
     color[edge] = sampled / len(_SAMPLES)
     return color.view(views, height, width, 3)
 
@@ -259,12 +262,11 @@ def _neighbours(surface: Tensor) -> Tensor:
     return torch.stack([surface, left, right, above, below]).flatten(1)
 
 
-def _nearest_of(
-    primitives: Primitives, candidates: Tensor, x: Tensor, y: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Nearest hit of rays [N] among K candidates each [K, N]: primitive (-1: none) and depth."""
+def _nearest_of(primitives: Primitives, candidates: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Which of K candidates [K, N] rays [N] hit first: 0 where they slip through them all."""
     depth = torch.full(x.shape, float("inf"), device=x.device)
-    nearest = torch.full_like(candidates[0], -1)
+    # Candidate -1 is the sky, behind everything; the pixel's own stands in where there is none.
+    nearest = torch.where((candidates < 0).any(0), (candidates < 0).int().argmax(0), 0)
     for k, candidate in enumerate(candidates):
         fresh = candidate >= 0
         for earlier in candidates[:k]:
@@ -276,8 +278,8 @@ def _nearest_of(
                 t = intersect_rays(primitives, shape, candidate[at], x[at, None], y[at, None])[:, 0]
                 wins = t < depth[at]
                 depth[at] = torch.where(wins, t, depth[at])
-                nearest[at] = torch.where(wins, candidate[at], nearest[at])
-    return nearest, depth
+                nearest[at] = torch.where(wins, k, nearest[at])
+    return nearest
 
 
 def _develop(color: Tensor, shots: list[Shot]) -> Tensor:

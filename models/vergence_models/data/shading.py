@@ -1,7 +1,6 @@
 """Colours of hits: filtered texture, two lights, soft shadow, gloss and mirrored surroundings.
 
-Everything works on flat lists of N samples, so pixel centres and the extra samples of edge pixels
-take the same path.
+Everything works on flat lists of N samples, a chunk at a time.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from vergence_models.data.raycast import to_local
 from vergence_models.data.shapes import Shape
 from vergence_models.data.textures import TextureBank
 
-_CHUNK = 32768
+_CHUNK = 16384
 _MAX_ANISOTROPY = 6.0
 _SHADOW_BIAS = 0.02  # of the distance to the light
 FACES = 8  # surface index = primitive * FACES + face
