@@ -164,7 +164,7 @@ def _session(
     method: Callable[Concatenate[DepthClient, Args], DepthSession],
 ) -> Callable[Concatenate["BlockingClient", Args], BlockingSession]:
     @functools.wraps(method)
-    def call(self: BlockingClient, /, *args: Args.args, **kwargs: Args.kwargs) -> BlockingSession:
+    def call(self: "BlockingClient", /, *args: Args.args, **kwargs: Args.kwargs) -> BlockingSession:
         return BlockingSession(method(self._inner, *args, **kwargs), self._loop)
 
     return call

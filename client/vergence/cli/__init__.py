@@ -1,0 +1,1 @@
+"""The ``vergence`` command. Needs the extra ``vergence[cli]``; the rest of the client does not."""

@@ -1,0 +1,85 @@
+"""``vergence demo``: the whole path on a bundled sequence, with a picture at the end."""
+
+import time
+from collections.abc import AsyncIterator, Sequence
+from contextlib import aclosing
+from importlib import resources
+from pathlib import Path
+
+from rich.console import Console
+
+from vergence.cli.pictures import Row, Video
+from vergence.cli.play import (
+    accuracy_of,
+    progress_bar,
+    row_of,
+    server_for,
+    shown_in_sheet,
+    source_at,
+    title_of,
+    write_json,
+    write_sheet,
+)
+from vergence.cli.report import Report
+from vergence.cli.streaming import Answered, every_frame
+from vergence.client import DepthClient
+from vergence_proto.layouts import SourceFrame, StereoSource
+from vergence_proto.types import Delivery
+
+_FPS_UNKNOWN = 30.0
+
+
+def bundled_sample() -> str:
+    return f"vergence:{resources.files('vergence') / 'sample' / 'room'}"
+
+
+async def demo(
+    source_text: str, *, frames: int | None, out: Path, json: Path | None, console: Console
+) -> None:
+    """Stream a source losslessly through a server of our own; show and save what came of it."""
+    source = source_at(source_text)
+    # Read before the clock starts: a camera does not decode files.
+    filmed = list(source)[:frames]
+    report = Report()
+    async with (
+        server_for(None, console) as server,
+        DepthClient(server) as client,
+        client.open_session(source.rig, delivery=Delivery.EVERY) as session,
+    ):
+        title = title_of(source, session.model.name)
+        answers: list[Answered] = []
+        with progress_bar(console) as progress:
+            bar = progress.add_task("streaming", total=len(filmed), note="")
+            started_s = time.monotonic()
+            async with aclosing(every_frame(session, _as_read(filmed), in_flight=1)) as stream:
+                async for answered in stream:
+                    answers.append(answered)
+                    progress.update(bar, advance=1, note=f"{1e3 * answered.latency_s:.0f} ms")
+            report.seconds = time.monotonic() - started_s
+    for answered in answers:
+        report.add(answered.latency_s, accuracy_of(answered))
+    _draw(source, title, [row_of(answered) for answered in answers], out, console)
+    console.print(report.as_table(title))
+    if json is not None:
+        write_json(json, report.as_json())
+
+
+async def _as_read(frames: Sequence[SourceFrame]) -> AsyncIterator[tuple[int, SourceFrame]]:
+    for index, frame in enumerate(frames):
+        yield index, frame
+
+
+def _draw(
+    source: StereoSource, title: str, rows: Sequence[Row], out: Path, console: Console
+) -> None:
+    out.mkdir(parents=True, exist_ok=True)
+    write_sheet(out / "demo.png", title, [rows[index] for index in shown_in_sheet(len(rows))])
+    console.print(f"picture  {out / 'demo.png'}")
+    try:
+        with Video(out / "demo.mp4", rows[0], title=title, fps=source.fps or _FPS_UNKNOWN) as video:
+            for row in rows:
+                video.add(row)
+    except OSError as error:  # a build of OpenCV without a video encoder
+        console.print(f"[yellow]no video: {error}[/]")
+    else:
+        console.print(f"video    {out / 'demo.mp4'}")

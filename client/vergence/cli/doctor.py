@@ -1,0 +1,112 @@
+"""``vergence doctor``: what is here, what is missing, and what to do about it."""
+
+import importlib.util
+import platform
+import socket
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import Enum
+from importlib import metadata
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from vergence.client import DepthClient
+from vergence_proto.errors import DepthError
+from vergence_proto.model_io import ManifestError, load_model_card
+
+# What each extra adds; the base install is checked besides.
+_PACKAGES = {
+    "": ("grpcio", "numpy", "opencv-python-headless", "protobuf"),
+    "server": ("fastapi", "grpcio-health-checking", "onnxruntime", "prometheus-client", "uvicorn"),
+    "zenoh": ("eclipse-zenoh",),
+    "train": ("torch", "onnx", "onnxscript"),
+}
+_DEFAULT_MODEL = "lite"
+_PORTS = {50051: "gRPC", 8000: "HTTP"}
+
+
+class Verdict(Enum):
+    GOOD = "[green]ok[/]"
+    NOTE = "[yellow]--[/]"  # not there, and not needed by everybody
+    BAD = "[red]no[/]"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    verdict: Verdict
+    what: str
+    detail: str
+
+
+async def doctor(server: str, console: Console) -> bool:
+    """Print all findings; False if something that everybody needs is wrong."""
+    findings = [_python(), *_packages(), *_ports(), _weights(), await _reachable(server)]
+    table = Table(show_header=False, box=None)
+    for finding in findings:
+        table.add_row(finding.verdict.value, finding.what, finding.detail)
+    console.print(table)
+    return all(finding.verdict is not Verdict.BAD for finding in findings)
+
+
+def _python() -> Finding:
+    found = platform.python_version()
+    verdict = Verdict.GOOD if sys.version_info >= (3, 11) else Verdict.BAD
+    return Finding(verdict, "python", f"{found} (3.11 or newer is needed)")
+
+
+def _packages() -> Iterator[Finding]:
+    for extra, names in _PACKAGES.items():
+        found, missing = [], []
+        for name in names:
+            try:
+                found.append(f"{name} {metadata.version(name)}")
+            except metadata.PackageNotFoundError:
+                missing.append(name)
+        package = f"vergence[{extra}]" if extra else "vergence"
+        if missing:
+            verdict = Verdict.NOTE if extra else Verdict.BAD
+            advice = f"without {', '.join(missing)}: pip install '{package}'"
+            yield Finding(verdict, package, advice)
+        else:
+            yield Finding(Verdict.GOOD, package, ", ".join(found))
+
+
+def _ports() -> Iterator[Finding]:
+    for port, use in _PORTS.items():
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError as error:
+                taken = f"127.0.0.1:{port} is taken ({error.strerror}): by a running server?"
+                yield Finding(Verdict.NOTE, f"{use} port", taken)
+            else:
+                yield Finding(Verdict.GOOD, f"{use} port", f"127.0.0.1:{port} is free")
+
+
+def _weights() -> Finding:
+    spec = importlib.util.find_spec("vergence_models")
+    if spec is None or spec.origin is None:
+        return Finding(Verdict.NOTE, "weights", "not installed: pip install 'vergence[server]'")
+    directory = Path(spec.origin).parent / "weights"
+    try:
+        card = load_model_card(directory, _DEFAULT_MODEL)
+    except ManifestError as error:
+        return Finding(Verdict.BAD, "weights", str(error))
+    told = f"{card.name} {card.weights_sha256[:12]}, as its manifest says"
+    return Finding(Verdict.GOOD, "weights", told)
+
+
+async def _reachable(server: str) -> Finding:
+    try:
+        async with DepthClient(server) as client:
+            info = await client.server_info()
+    except DepthError as error:
+        return Finding(Verdict.NOTE, "server", str(error))
+    model = f"{info.model.name} {info.model.weights_sha256[:12]}"
+    streams = f"{info.streams_open} of {info.streams_max} streams"
+    about = f"{server} runs {info.version}, model {model} on {info.provider}, {streams}"
+    return Finding(Verdict.GOOD, "server", about)

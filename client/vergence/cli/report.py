@@ -1,0 +1,86 @@
+"""What a run amounts to: speed, and accuracy where the truth is known."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from rich.table import Table
+
+from vergence.results import Drops
+from vergence_proto.accuracy import Accuracy
+
+
+@dataclass(slots=True)
+class Report:
+    """Filled while frames come back; ``seconds`` is the time from the first to the last of them."""
+
+    latencies_s: list[float] = field(default_factory=list)
+    accuracies: list[Accuracy] = field(default_factory=list)
+    seconds: float = 0.0
+    drops: Drops = field(default_factory=Drops)
+
+    def add(self, latency_s: float, accuracy: Accuracy | None) -> None:
+        self.latencies_s.append(latency_s)
+        if accuracy is not None:
+            self.accuracies.append(accuracy)
+
+    @property
+    def accuracy(self) -> Accuracy | None:
+        """The mean over the frames with truth; None if there are none."""
+        mean = Accuracy.mean(self.accuracies)
+        return mean if mean.n else None
+
+    def as_json(self) -> Mapping[str, float | int | None]:
+        """The keys that other programs read; accuracy is null where no truth is known."""
+        p50_ms, p95_ms = self._percentiles_ms()
+        mean = self.accuracy
+        return {
+            "frames": len(self.latencies_s),
+            "frames_dropped": self.drops.total,
+            "fps": self.fps,
+            "latency_p50_ms": p50_ms,
+            "latency_p95_ms": p95_ms,
+            "epe_px": mean.epe_px if mean else None,
+            "d1_pct": mean.d1_pct if mean else None,
+            "d3_pct": mean.d3_pct if mean else None,
+        }
+
+    @property
+    def fps(self) -> float:
+        return len(self.latencies_s) / self.seconds if self.seconds > 0 else 0.0
+
+    def as_table(self, title: str) -> Table:
+        p50_ms, p95_ms = self._percentiles_ms()
+        table = Table(title=title, title_justify="left", show_header=False)
+        table.add_column(style="bold")
+        table.add_column(justify="right")
+        table.add_column(style="dim")
+        table.add_row("frames", str(len(self.latencies_s)), "answered")
+        if self.drops.total:
+            table.add_row("dropped", str(self.drops.total), _told(self.drops))
+        table.add_row("fps", f"{self.fps:.1f}", "end to end")
+        table.add_row("latency p50", f"{p50_ms:.1f} ms", "from sending a frame to its depth")
+        table.add_row("latency p95", f"{p95_ms:.1f} ms", "")
+        if mean := self.accuracy:
+            table.add_row("EPE", f"{mean.epe_px:.2f} px", "mean absolute error of disparity")
+            table.add_row("D1", f"{mean.d1_pct:.1f} %", "pixels off by more than 1 px")
+            table.add_row("D3", f"{mean.d3_pct:.1f} %", "by more than 3 px")
+        return table
+
+    def _percentiles_ms(self) -> tuple[float, float]:
+        if not self.latencies_s:
+            return 0.0, 0.0
+        p50_s, p95_s = np.percentile(self.latencies_s, (50, 95))
+        return 1e3 * float(p50_s), 1e3 * float(p95_s)
+
+
+def _told(drops: Drops) -> str:
+    """Where frames were dropped, those places that had any."""
+    places = {
+        "at the source": drops.at_source,
+        "displaced in the server": drops.displaced,
+        "too old": drops.stale,
+        "unread": drops.unread,
+        "lost with the connection": drops.lost,
+    }
+    return ", ".join(f"{count} {place}" for place, count in places.items() if count)
