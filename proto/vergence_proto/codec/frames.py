@@ -62,10 +62,11 @@ def frame_to_proto(
     return message
 
 
-def frame_from_proto(message: pb.Frame) -> StereoFrame:
-    """Decode both images and the pose.
+def frame_from_proto(message: pb.Frame, *, size: tuple[int, int] | None = None) -> StereoFrame:
+    """Decode both images and the pose. ``size`` is the (width, height) that both must have.
 
-    Raises BadShape: no frame id, two sizes, or a maximum age that is no length of time.
+    Raises BadShape: no frame id, another size than ``size`` or two sizes (no image is decoded
+    then), or a maximum age that is no length of time.
     Raises BadImage, BadPose: as :func:`image_from_proto` and :func:`pose_sample_from_proto`.
     """
     if message.frame_id == 0:
@@ -77,6 +78,11 @@ def frame_from_proto(message: pb.Frame) -> StereoFrame:
         raise BadShape(
             f"both images must have one size, got left {left.width}x{left.height} "
             f"and right {right.width}x{right.height}"
+        )
+    if size is not None and (left.width, left.height) != size:
+        raise BadShape(
+            f"expected images of {size[0]}x{size[1]}, as the stream was opened with, "
+            f"got {left.width}x{left.height}"
         )
     return StereoFrame(
         frame_id=message.frame_id,
