@@ -1,0 +1,76 @@
+"""What a network is made of and how it is trained: frozen values, one entry per tier."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+
+
+class ConfigError(ValueError):
+    """A configuration is unknown, or differs from the one a file was made with."""
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkConfig:
+    """The shape of one network. Widths are channel counts; scales are fixed by the code."""
+
+    max_disparity_px: int = 192
+    stride: int = 32  # H and W are multiples of it
+    fine_bits: int = 48  # census comparisons per cell at 1/4, from the half-size image
+    coarse_bits: int = 48  # census comparisons per cell at 1/8, from the quarter-size image
+    context_quarter: int = 32
+    context_eighth: int = 48
+    context_low: int = 64  # 1/16 and 1/32
+    cost_channels: int = 16  # of the filter that all coarse disparities share
+    hidden: int = 32  # recurrent state at 1/8
+    fine_channels: int = 32
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingConfig:
+    """How a network is trained; every field can be reached by the same name on the command line."""
+
+    seed: int = 1
+    batch: int = 4
+    frames: int = 3  # of a clip
+    learning_rate: float = 1e-3
+    warmup_steps: int = 200
+    decay_steps: int = 12_000  # cosine from the peak to a tenth of it, then constant
+    weight_decay: float = 1e-5
+    gradient_norm: float = 1.0
+    ema_decay: float = 0.998
+    identity_share: float = 0.05  # clips that hide the motion: the network must cope without poses
+    noise_share: float = 0.3  # clips whose poses are off by up to the two limits below
+    noise_deg: float = 0.3
+    noise_m: float = 0.002
+    reset_share: float = 0.1  # frames that lose their state
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """One tier."""
+
+    name: str
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+    iterations: tuple[int, ...] = (1, 2, 4, 8)  # graphs to export
+
+
+CONFIGS = {config.name: config for config in (Config("lite"),)}
+
+
+def load_config(name: str) -> Config:
+    """The tier of that name. Raises ConfigError and names those there are."""
+    try:
+        return CONFIGS[name]
+    except KeyError:
+        raise ConfigError(f"no configuration {name!r}; there are: {', '.join(CONFIGS)}") from None
+
+
+def network_from_dict(values: dict[str, int], source: str) -> NetworkConfig:
+    """The inverse of ``dataclasses.asdict``. Raises ConfigError naming ``source``."""
+    known = {entry.name for entry in dataclasses.fields(NetworkConfig)}
+    if set(values) != known:
+        odd = ", ".join(sorted(set(values) ^ known))
+        raise ConfigError(f"{source}: expected the fields of NetworkConfig, these differ: {odd}")
+    return NetworkConfig(**values)

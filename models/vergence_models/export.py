@@ -1,0 +1,209 @@
+"""``python -m vergence_models.export``: one ONNX graph per iteration count, and the manifest.
+
+The graphs hold the same weights. Each is checked against PyTorch over a short sequence before it is
+written down in the manifest.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import hashlib
+import json
+import logging
+import warnings
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from vergence_models.config import Config, NetworkConfig, load_config
+from vergence_models.network import State, StereoNetwork
+from vergence_models.runs import Run, read_run
+from vergence_proto.model_io import (
+    DISPARITY,
+    LEFT,
+    MANIFEST_FORMAT,
+    MANIFEST_NAME,
+    RIGHT,
+    SIGMA,
+    UVD_CURR_FROM_PREV,
+    StateTensor,
+)
+
+log = logging.getLogger("vergence_models.export")
+
+OPSET = 18  # ScatterElements gained reduction="max" there
+# PyTorch and onnxruntime sum in different orders; over three frames the recurrence and the choice
+# between two equal hypotheses enlarge that, but only here and there.
+PARITY_MEAN_PX = 2e-3
+
+
+class ParityError(RuntimeError):
+    """A graph does not compute what the PyTorch network computes."""
+
+
+def state_tensors(config: NetworkConfig) -> tuple[StateTensor, ...]:
+    """The recurrent state as the contract names it, in the order of :class:`State`."""
+    return (StateTensor("disparity", 1, 4), StateTensor("hidden_0", config.hidden, 8))
+
+
+class StepGraph(nn.Module):
+    """The step with flat tensors in and out, in the order of the contract."""
+
+    def __init__(self, network: StereoNetwork, iterations: int) -> None:
+        super().__init__()
+        self.network = network
+        self.iterations = iterations
+
+    def forward(
+        self, left: Tensor, right: Tensor, matrix: Tensor, disparity: Tensor, hidden: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        state = State(disparity, hidden)
+        estimate, following = self.network(left, right, matrix, state, self.iterations)
+        return estimate.disparity, estimate.sigma, following.disparity, following.hidden
+
+
+def export_graph(network: StereoNetwork, iterations: int, path: Path) -> None:
+    """Write one graph with dynamic batch, height and width."""
+    config = network.config
+    stride = config.stride
+    batch = torch.export.Dim("batch", min=1, max=256)
+    rows = torch.export.Dim("rows", min=1, max=128)
+    columns = torch.export.Dim("columns", min=1, max=128)
+    image = {0: batch, 1: stride * rows, 2: stride * columns}
+    tensors = state_tensors(config)
+    states = tuple(
+        {0: batch, 2: stride // t.scale * rows, 3: stride // t.scale * columns} for t in tensors
+    )
+    height, width = 6 * stride, 8 * stride
+    # Two tensors: the exporter would take one object for one input, and match left with left.
+    left, right = (torch.zeros(2, height, width, 3, dtype=torch.uint8) for _ in range(2))
+    matrices = torch.eye(4).repeat(2, 1, 1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the exporter's own deprecations
+        torch.onnx.export(
+            StepGraph(network, iterations),
+            (left, right, matrices, *network.cold_state(2, height, width)),
+            str(path),
+            dynamo=True,
+            verbose=False,
+            external_data=False,
+            opset_version=OPSET,
+            dynamic_shapes=(image, image, {0: batch}, *states),
+            input_names=[LEFT, RIGHT, UVD_CURR_FROM_PREV, *(t.input_name for t in tensors)],
+            output_names=[DISPARITY, SIGMA, *(t.output_name for t in tensors)],
+        )
+    slim(path)
+
+
+def slim(path: Path) -> None:
+    """Drop what the exporter notes about the author's machine (stack traces, file paths)."""
+    model = onnx.load(path)
+    for node in model.graph.node:
+        del node.metadata_props[:]
+    del model.graph.value_info[:]
+    del model.metadata_props[:]
+    onnx.save(model, path)
+
+
+def shifted_pair(height: int, width: int, seed: int) -> tuple[NDArray[np.uint8], ...]:
+    """A textured pair, uint8 [1, H, W, 3], whose disparity grows from the top to the bottom."""
+    rng = np.random.default_rng(seed)
+    noise = rng.uniform(0, 255, (height // 4 + 1, width // 2 + 40, 3))
+    wall = np.repeat(np.repeat(noise, 4, axis=0), 4, axis=1)[:height]
+    shift = np.linspace(4, 40, height).astype(int)
+    left = wall[:, 40 : 40 + width]
+    right = np.stack([wall[y, 40 + s : 40 + s + width] for y, s in enumerate(shift)])
+    return left[None].astype(np.uint8), right[None].astype(np.uint8)
+
+
+def check_parity(network: StereoNetwork, iterations: int, path: Path, *, frames: int = 3) -> float:
+    """The mean difference from PyTorch in px over a short sequence; raises ParityError if large."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 2
+    session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    height, width = 6 * network.config.stride, 8 * network.config.stride
+    state = network.cold_state(1, height, width)
+    arrays = [tensor.numpy() for tensor in state]
+    matrix = np.eye(4, dtype=np.float32)[None]
+    matrix[0, 0, 3] = 1.25  # the view moves
+    worst = 0.0
+    for frame in range(frames):
+        left, right = shifted_pair(height, width, frame)
+        feed = dict(
+            zip([node.name for node in session.get_inputs()], [left, right, matrix, *arrays])
+        )
+        disparity, sigma, *arrays = session.run(None, feed)
+        with torch.inference_mode():
+            estimate, state = network(
+                torch.from_numpy(left),
+                torch.from_numpy(right),
+                torch.from_numpy(matrix),
+                state,
+                iterations,
+            )
+        difference = np.abs(disparity - estimate.disparity.numpy()).mean()
+        worst = max(worst, float(difference), float(np.abs(sigma - estimate.sigma.numpy()).mean()))
+    if not worst < PARITY_MEAN_PX:
+        raise ParityError(
+            f"{path}: differs from PyTorch by {worst:.2g} px on average, "
+            f"expected less than {PARITY_MEAN_PX:g}"
+        )
+    return worst
+
+
+def export_run(run: Run, config: Config, out: Path) -> None:
+    """Write every graph of one tier and its entry of the manifest; other entries stay."""
+    network = StereoNetwork(run.network).eval()
+    network.load_state_dict(run.weights)
+    out.mkdir(parents=True, exist_ok=True)
+    graphs = {}
+    for iterations in config.iterations:
+        path = out / f"{config.name}_{iterations}.onnx"
+        export_graph(network, iterations, path)
+        worst = check_parity(network, iterations, path)
+        log.info("%s: differs from PyTorch by at most %.1e px on average", path.name, worst)
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        graphs[str(iterations)] = {"file": path.name, "sha256": digest}
+    entry = {
+        "stride": run.network.stride,
+        "max_disparity_px": run.network.max_disparity_px,
+        "state": [dataclasses.asdict(tensor) for tensor in state_tensors(run.network)],
+        "graphs": graphs,
+        "architecture": dataclasses.asdict(run.network),
+        "parameters": sum(p.numel() for p in network.parameters()),
+        "training": run.story,
+        "measured": run.measured,
+    }
+    write_entry(out / MANIFEST_NAME, config.name, entry)
+
+
+def write_entry(path: Path, name: str, entry: dict[str, object]) -> None:
+    """Add or replace one model of the manifest."""
+    manifest: dict[str, object] = {"format": MANIFEST_FORMAT, "models": {}}
+    if path.exists():
+        manifest = json.loads(path.read_text("utf-8"))
+    cast("dict[str, object]", manifest["models"])[name] = entry
+    path.write_text(json.dumps(manifest, indent=1) + "\n", "utf-8")
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(prog="vergence_models.export", description=__doc__)
+    parser.add_argument("--run", type=Path, required=True, help="folder of a training run")
+    parser.add_argument("--out", type=Path, required=True, help="folder for graphs and manifest")
+    given = parser.parse_args(arguments)
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    logging.getLogger("onnxscript").setLevel(logging.ERROR)
+    run = read_run(given.run)
+    export_run(run, load_config(run.config_name), given.out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,187 @@
+"""The parts of the network: census descriptors, volumes and lookups, the cell, the upsampler.
+
+Each is written the way onnxruntime runs it fast on a CPU: matrix products and gathers along the
+last axis, exp and sum instead of Softmax, slices instead of unfold, no norm layers. And each starts
+from what classical stereo knows, with the learned part at zero, so that an untrained network
+already matches.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor, nn
+
+# Comparisons of a pixel with half of its 5x5 neighbourhood: the other half would repeat them.
+CENSUS_OFFSETS = (
+    (1, 0), (2, 0), (0, 1), (0, 2), (1, 1), (-1, 1),
+    (2, 1), (-2, 1), (1, 2), (-1, 2), (2, 2), (-2, 2),
+)  # fmt: skip
+
+
+class CensusDescriptor(nn.Module):
+    """Soft census bits of every 2x2 block of pixels: clip(difference / contrast, -1, 1).
+
+    One convolution with a clip. It starts as the census transform, whose sign is softened so that
+    noise on a blank wall is no pattern, and learns from there.
+    """
+
+    def __init__(self, bits: int, *, contrast: float) -> None:
+        super().__init__()
+        weight = torch.zeros(bits, 1, 6, 6)
+        for bit in range(bits):
+            dx, dy = CENSUS_OFFSETS[bit // 4 % len(CENSUS_OFFSETS)]
+            x, y = 2 + bit % 2, 2 + bit // 2 % 2
+            weight[bit, 0, y, x] = -1 / contrast
+            weight[bit, 0, y + dy, x + dx] = 1 / contrast
+        self.weight = nn.Parameter(weight)
+
+    def forward(self, gray: Tensor, column_stride: int) -> Tensor:
+        """``gray`` [B, 1, H, W] to [B, bits, H/2, W/column_stride]; column c starts at pixel
+        c * column_stride."""
+        padded = F.pad(gray, (2, 3, 2, 3), mode="replicate")
+        bits = F.conv2d(padded, self.weight, stride=(2, column_stride))
+        return bits.clamp(-1, 1)
+
+
+def all_pairs(left: Tensor, right: Tensor) -> Tensor:
+    """Mean product of descriptors along each row: [B, C, H, W] x [B, C, H, W'] -> [B, H, W, W']."""
+    scaled = left.permute(0, 2, 1, 3).transpose(2, 3) * (1 / left.shape[1])
+    return torch.matmul(scaled, right.permute(0, 2, 1, 3))
+
+
+def banded(pairs: Tensor, disparities: int) -> Tensor:
+    """Re-index all pairs (x, x') [B, H, W, rW] by disparity r x - x': [B, H, W, D], 0 outside.
+
+    Row x of the result starts r entries later than row x - 1 in memory; so with rows that are r
+    entries longer it becomes a plain slice. Columns run from the largest disparity to 0.
+    """
+    batch, height, width, columns = pairs.shape
+    ratio = columns // width
+    first = disparities - 1
+    flat = F.pad(pairs.reshape(batch, height, width * columns), (first, columns - first))
+    skewed = flat.view(batch, height, width, columns + ratio)[..., :disparities]
+    x = torch.arange(width, device=pairs.device)[:, None]
+    d = torch.arange(first, -1, -1, device=pairs.device)[None, :]
+    return skewed * (d <= x * ratio).to(pairs.dtype)
+
+
+def lookup(volume: Tensor, position: Tensor) -> Tensor:
+    """Linear interpolation along the last axis: [B, H, W, N] at [B, H, W, K]; 0 outside."""
+    last = volume.shape[-1] - 1
+    low = torch.floor(position)
+    inside = ((low >= 0) & (low < last)).to(volume.dtype)
+    index = low.clamp(0, last - 1).long()
+    below = volume.gather(3, index)
+    above = volume.gather(3, index + 1)
+    return (below + (above - below) * (position - low)) * inside
+
+
+def lookup_row(volume: Tensor, position: Tensor, reach: int) -> Tensor:
+    """:func:`lookup` at position - reach .. position + reach: [B, H, W, 1] to [B, H, W, 2 reach + 1].
+
+    Neighbouring positions share their entries, so it costs half the gathers.
+    """
+    last = volume.shape[-1] - 1
+    low = torch.floor(position)
+    index = low + torch.arange(-reach, reach + 2, device=volume.device).to(volume.dtype)
+    inside = ((index >= 0) & (index <= last)).to(volume.dtype)
+    entries = volume.gather(3, index.clamp(0, last).long()) * inside
+    below, above = entries[..., :-1], entries[..., 1:]
+    return below + (above - below) * (position - low)
+
+
+def box3(x: Tensor) -> Tensor:
+    """Mean over 3x3 cells, borders counting the cells there are: [B, C, H, W]."""
+    return F.avg_pool2d(x, 3, stride=1, padding=1, count_include_pad=False)
+
+
+def shares(scores: Tensor, dim: int) -> Tensor:
+    """Softmax as exp and sum: the operator is twenty times slower off the last axis."""
+    weights = torch.exp(scores - scores.amax(dim=dim, keepdim=True))
+    return weights / weights.sum(dim=dim, keepdim=True)
+
+
+def conv(inputs: int, outputs: int, *, kernel: int = 3, stride: int = 1) -> nn.Conv2d:
+    """A padded convolution with He initialisation and no bias offset."""
+    layer = nn.Conv2d(inputs, outputs, kernel, stride, padding=kernel // 2)
+    nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+    nn.init.zeros_(layer.bias)  # type: ignore[arg-type]  # bias=True above
+    return layer
+
+
+def silent(layer: nn.Conv2d) -> nn.Conv2d:
+    """The same layer with zero output: what it adds has to be learned."""
+    nn.init.zeros_(layer.weight)
+    return layer
+
+
+class GatedCell(nn.Module):
+    """A convolutional GRU cell: hidden [B, C, H, W] and inputs [B, I, H, W] to the next hidden."""
+
+    def __init__(self, hidden: int, inputs: int) -> None:
+        super().__init__()
+        self.gates = conv(hidden + inputs, 2 * hidden)
+        self.candidate = conv(hidden + inputs, hidden)
+        nn.init.xavier_normal_(self.gates.weight)
+        nn.init.xavier_normal_(self.candidate.weight)
+        self.hidden = hidden
+
+    def forward(self, hidden: Tensor, inputs: Tensor) -> Tensor:
+        gates = torch.sigmoid(self.gates(torch.cat((hidden, inputs), dim=1)))
+        update, reset = gates[:, : self.hidden], gates[:, self.hidden :]
+        candidate = torch.tanh(self.candidate(torch.cat((reset * hidden, inputs), dim=1)))
+        return hidden + update * (candidate - hidden)
+
+
+class ConvexUpsampler(nn.Module):
+    """Each pixel of a 4x4 block is a convex combination of the four cells round its quadrant.
+
+    It starts as bilinear upsampling; a pixel beside an edge learns to take one side. The four
+    nearest cells do what nine would, at less than half the price.
+    """
+
+    FACTOR = 4
+
+    def __init__(self, inputs: int) -> None:
+        super().__init__()
+        self.mask = silent(conv(inputs, 64, kernel=1))
+        with torch.no_grad():
+            bias = torch.empty(2, 2, 4, 2, 2)  # quadrant (y, x), cell, pixel in quadrant (y, x)
+            for qy, qx, ry, rx in itertools.product(range(2), repeat=4):
+                # Distance from the cell's centre towards the neighbour on this quadrant's side.
+                y = abs((2 * qy + ry + 0.5) / 4 - 0.5)
+                x = abs((2 * qx + rx + 0.5) / 4 - 0.5)
+                weights = ((1 - y) * (1 - x), (1 - y) * x, y * (1 - x), y * x)
+                bias[qy, qx, :, ry, rx] = torch.log(torch.tensor(weights))
+            self.mask.bias.copy_(bias.flatten())  # type: ignore[union-attr]  # conv has a bias
+
+    def forward(self, features: Tensor, disparity: Tensor) -> Tensor:
+        """``features`` [B, C, h, w], ``disparity`` [B, 1, h, w] to [B, 4 h, 4 w]."""
+        batch, _, height, width = disparity.shape
+        # Bounded scores need no maximum to be subtracted before the exponential.
+        weights = torch.exp(self.mask(features).clamp(-12, 12))
+        padded = F.pad(disparity, (1, 1, 1, 1), mode="replicate")
+
+        def cell(dy: int, dx: int) -> Tensor:
+            return padded[:, :, 1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
+
+        quadrants = []
+        for quadrant, (dy, dx) in enumerate(itertools.product((-1, 1), repeat=2)):
+            part = weights[:, 16 * quadrant : 16 * quadrant + 16]
+            shares_of = [part[:, 4 * k : 4 * k + 4] for k in range(4)]
+            cells = (disparity, cell(0, dx), cell(dy, 0), cell(dy, dx))
+            total = sum(share * near for share, near in zip(shares_of, cells, strict=True))
+            quadrants.append(total / sum(shares_of))
+        blocks = torch.cat(quadrants, dim=1).view(batch, 2, 2, 2, 2, height, width)
+        # (qy, qx, ry, rx, h, w) to rows (h, qy, ry) and columns (w, qx, rx).
+        ordered = blocks.permute(0, 5, 1, 3, 6, 2, 4)
+        return ordered.reshape(batch, self.FACTOR * height, self.FACTOR * width)
+
+
+def squash(px: Tensor, scale: float) -> Tensor:
+    """Signed logarithm of a difference in pixels: fine near zero, bounded far from it."""
+    return torch.sign(px) * torch.log1p(px.abs() / scale) / math.log(10.0)

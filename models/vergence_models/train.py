@@ -1,0 +1,291 @@
+"""``python -m vergence_models.train``: train one tier on pools of clips, as long as you like.
+
+    python -m vergence_models.train --config lite --pool pool/a pool/b --val pool/val --out runs/lite
+    python -m vergence_models.train ... --out runs/lite --resume --minutes 60
+
+A run can be stopped at any minute (a signal or ``--minutes``) and goes on where it was: weights,
+moving average, optimizer, step and random states are in its checkpoint.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import logging
+import math
+import shlex
+import signal
+import sys
+import time
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from vergence_models.config import CONFIGS, Config, load_config
+from vergence_models.data.clips import StereoClips
+from vergence_models.data.pool import ClipPool
+from vergence_models.data.sensor import SensorModel
+from vergence_models.losses import step_loss
+from vergence_models.motion import perturbed, uvd_transforms
+from vergence_models.network import State, StereoNetwork
+from vergence_models.runs import (
+    CHECKPOINT_NAME,
+    Progress,
+    load_checkpoint,
+    require_same_network,
+    save_checkpoint,
+)
+from vergence_models.validation import save_picture, validate
+
+log = logging.getLogger("vergence_models.train")
+
+
+def learning_rate(config: Config, step: int) -> float:
+    """Linear warm-up, cosine to a tenth, then constant: a run can always be extended."""
+    training = config.training
+    warm = min(1.0, (step + 1) / training.warmup_steps)
+    done = min(1.0, step / training.decay_steps)
+    return training.learning_rate * warm * (0.1 + 0.45 * (1 + math.cos(math.pi * done)))
+
+
+class Trainer:
+    """Weights and everything that changes while they are trained."""
+
+    def __init__(self, config: Config, device: torch.device) -> None:
+        torch.manual_seed(config.training.seed)
+        self.config = config
+        self.device = device
+        self.network = StereoNetwork(config.network).to(device)
+        self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
+        self.optimizer = torch.optim.AdamW(
+            self.network.parameters(),
+            lr=config.training.learning_rate,
+            betas=(0.9, 0.99),
+            weight_decay=config.training.weight_decay,
+        )
+        self.random = torch.Generator().manual_seed(config.training.seed)
+        self.progress = Progress()
+        self.measured: dict[str, float] = {}
+        self.commands: list[str] = []
+
+    def save(self, folder: Path) -> None:
+        training = self.config.training
+        story = {
+            "commands": self.commands,
+            **dataclasses.asdict(self.progress),
+            "device": self.device.type,
+            "seed": training.seed,
+        }
+        save_checkpoint(
+            folder / CHECKPOINT_NAME,
+            {
+                "config": self.config.name,
+                "network": dataclasses.asdict(self.config.network),
+                "weights": self.network.state_dict(),
+                "average": self.average,
+                "optimizer": self.optimizer.state_dict(),
+                "random": self.random.get_state(),
+                "torch_random": torch.get_rng_state(),
+                "progress": dataclasses.asdict(self.progress),
+                "story": story,
+                "measured": self.measured,
+            },
+        )
+
+    def resume(self, folder: Path) -> None:
+        """Go on from a run's checkpoint. Raises RunError if it is of another configuration."""
+        contents = load_checkpoint(folder)
+        require_same_network(contents, self.config, folder / CHECKPOINT_NAME)
+        self.network.load_state_dict(contents["weights"])
+        self.average = {k: v.to(self.device) for k, v in contents["average"].items()}
+        self.optimizer.load_state_dict(contents["optimizer"])
+        self.random.set_state(contents["random"])
+        torch.set_rng_state(contents["torch_random"])
+        self.progress = Progress(**contents["progress"])
+        self.measured = contents["measured"]
+        self.commands = contents["story"]["commands"]
+
+    def chance(self, share: float) -> bool:
+        return bool(torch.rand((), generator=self.random) < share)
+
+    def pick(self, low: int, high: int) -> int:
+        """An integer from ``low`` to ``high``, both included."""
+        return int(torch.randint(low, high + 1, (), generator=self.random))
+
+    def transforms(self, clips: StereoClips) -> Tensor:
+        """The motion the network is told, float32 [B, T, 4, 4]: true, noisy, or none at all."""
+        training = self.config.training
+        poses = clips.world_from_left
+        if self.chance(training.identity_share):
+            poses = poses[:, :1].expand_as(poses)
+        elif self.chance(training.noise_share):
+            poses = perturbed(
+                poses, max_deg=training.noise_deg, max_m=training.noise_m, random=self.random
+            )
+        return uvd_transforms(clips, poses)
+
+    def step(self, clips: StereoClips) -> dict[str, float]:
+        """One update on a batch of clips, with the gradient through the whole clip."""
+        training, network = self.config.training, self.network
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate(self.config, self.progress.steps)
+        matrices = self.transforms(clips).to(self.device)
+        clips = clips.to(self.device)
+        batch, frames, _, height, width = clips.left.shape
+        state = cold = State(*(t.to(self.device) for t in network.cold_state(batch, height, width)))
+        loss = torch.zeros((), device=self.device)
+        errors = []
+        for frame in range(frames):
+            reset = frame == 0 or self.chance(training.reset_share)
+            if reset:
+                state = cold
+            iterations = self.pick(1, 4) if reset else 1 + int(self.chance(0.2))
+            left, right = (
+                eye[:, frame].permute(0, 2, 3, 1).contiguous() for eye in (clips.left, clips.right)
+            )
+            estimate, state = network(left, right, matrices[:, frame], state, iterations)
+            truth = clips.disparity_px[:, frame]
+            loss = loss + step_loss(estimate, truth, self.config.network.max_disparity_px) / frames
+            errors.append((estimate.disparity.detach() - truth).abs()[truth > 0].mean().item())
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        norm = torch.nn.utils.clip_grad_norm_(network.parameters(), training.gradient_norm)
+        if torch.isfinite(norm):  # one bad batch must not end a long run
+            self.optimizer.step()
+        # A young average follows quickly, an old one slowly.
+        decay = min(training.ema_decay, (1 + self.progress.steps) / (10 + self.progress.steps))
+        for name, value in network.state_dict().items():
+            self.average[name].lerp_(value, 1 - decay)
+        self.progress.steps += 1
+        self.progress.frames += batch * frames
+        return {
+            "loss": loss.item(),
+            "norm": norm.item(),
+            "first": errors[0],
+            "later": float(np.mean(errors[1:])) if frames > 1 else errors[0],
+        }
+
+    def averaged_network(self) -> StereoNetwork:
+        """The network with the averaged weights: the one to validate and export."""
+        network = StereoNetwork(self.config.network).to(self.device).eval()
+        network.load_state_dict(self.average)
+        return network
+
+
+def train(trainer: Trainer, arguments: argparse.Namespace) -> None:
+    """The loop: step, log, save, validate, until a signal or the minutes are over."""
+    stop = False
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        nonlocal stop
+        stop = True
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, on_signal)
+    pool = ClipPool(arguments.pool)
+    sensor = SensorModel()
+    held_out = ClipPool(arguments.val) if arguments.val else None
+    out: Path = arguments.out
+    training = trainer.config.training
+    started = saved = validated = last = time.monotonic()
+    recent: list[dict[str, float]] = []
+
+    def elapsed_minutes() -> float:
+        return (time.monotonic() - started) / 60
+
+    while not stop and elapsed_minutes() < arguments.minutes:
+        clips = pool.sample(training.batch, generator=trainer.random)
+        clips = sensor(clips, trainer.random)
+        recent.append(trainer.step(clips))
+        now = time.monotonic()
+        trainer.progress.minutes += (now - last) / 60
+        last = now
+        if len(recent) == arguments.log_every:
+            report(out, trainer, recent)
+            recent = []
+        if now - saved > 60 * arguments.save_minutes:
+            saved = now
+            trainer.save(out)
+        if held_out is not None and now - validated > 60 * arguments.val_minutes:
+            network = trainer.averaged_network()
+            trainer.measured = validate(network, held_out, trainer.device)
+            save_picture(network, held_out, out / "sample.png", trainer.device)
+            write_line(out, {"step": trainer.progress.steps, "validation": trainer.measured})
+            trainer.save(out)
+            validated = saved = last = time.monotonic()
+    if held_out is not None and trainer.progress.steps:
+        trainer.measured = validate(trainer.averaged_network(), held_out, trainer.device)
+        write_line(out, {"step": trainer.progress.steps, "validation": trainer.measured})
+    trainer.save(out)
+
+
+def report(out: Path, trainer: Trainer, recent: list[dict[str, float]]) -> None:
+    means = {key: float(np.mean([entry[key] for entry in recent])) for key in recent[0]}
+    progress = trainer.progress
+    write_line(
+        out,
+        {
+            "step": progress.steps,
+            "minutes": round(progress.minutes, 1),
+            "rate": learning_rate(trainer.config, progress.steps),
+            **{key: round(value, 4) for key, value in means.items()},
+        },
+    )
+
+
+def write_line(out: Path, values: dict[str, Any]) -> None:
+    """Append one JSON line to the run's log and say it."""
+    line = json.dumps(values)
+    with (out / "log.jsonl").open("a", encoding="utf-8") as file:
+        file.write(line + "\n")
+    log.info("%s", line)
+
+
+def parse(arguments: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="vergence_models.train", description=__doc__)
+    add = parser.add_argument
+    add("--config", default="lite", choices=list(CONFIGS))
+    add("--pool", type=Path, nargs="+", required=True, help="folders of pre-rendered clips")
+    add("--val", type=Path, nargs="*", default=[], help="folders of held-out clips")
+    add("--out", type=Path, required=True, help="folder of the run")
+    add("--resume", action="store_true", help="go on with the run in --out")
+    add("--minutes", type=float, default=math.inf, help="of this session")
+    add("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    add("--log-every", type=int, default=20, help="steps")
+    add("--save-minutes", type=float, default=3)
+    add("--val-minutes", type=float, default=10)
+    group = parser.add_argument_group("training", "fields of TrainingConfig")
+    for entry in dataclasses.fields(type(CONFIGS["lite"].training)):
+        kind = type(getattr(CONFIGS["lite"].training, entry.name))
+        group.add_argument(f"--{entry.name.replace('_', '-')}", type=kind, default=None)
+    return parser.parse_args(arguments)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    given = parse(arguments)
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    config = load_config(given.config)
+    changed = {
+        entry.name: getattr(given, entry.name)
+        for entry in dataclasses.fields(config.training)
+        if getattr(given, entry.name) is not None
+    }
+    config = dataclasses.replace(config, training=dataclasses.replace(config.training, **changed))
+    trainer = Trainer(config, torch.device(given.device))
+    if given.resume:
+        trainer.resume(given.out)
+    elif (given.out / CHECKPOINT_NAME).exists():
+        sys.exit(f"{given.out} already holds a run; add --resume or choose another folder")
+    given.out.mkdir(parents=True, exist_ok=True)
+    words = arguments if arguments is not None else sys.argv[1:]
+    trainer.commands.append(shlex.join(["python", "-m", "vergence_models.train", *words]))
+    train(trainer, given)
+
+
+if __name__ == "__main__":
+    main()

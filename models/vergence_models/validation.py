@@ -1,0 +1,92 @@
+"""How good a network is on held-out synthetic clips: the figures that choices are made by."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from vergence_models.data.clips import StereoClips
+from vergence_models.data.pool import ClipPool
+from vergence_models.losses import known
+from vergence_models.motion import uvd_transforms
+from vergence_models.network import Estimate, State, StereoNetwork
+
+COLD_ITERATIONS = 4
+
+
+@torch.inference_mode()
+def predict(
+    network: StereoNetwork, clips: StereoClips, device: torch.device, *, iterations: int = 1
+) -> list[Estimate]:
+    """The estimate of every frame of the clips, cold on the first, then warm."""
+    matrices = uvd_transforms(clips, clips.world_from_left).to(device)
+    batch, frames, _, height, width = clips.left.shape
+    state = State(*(t.to(device) for t in network.cold_state(batch, height, width)))
+    estimates = []
+    for frame in range(frames):
+        left, right = (
+            eye[:, frame].permute(0, 2, 3, 1).contiguous().to(device)
+            for eye in (clips.left, clips.right)
+        )
+        count = iterations if frame else COLD_ITERATIONS
+        estimate, state = network(left, right, matrices[:, frame], state, count)
+        estimates.append(estimate)
+    return estimates
+
+
+def validate(
+    network: StereoNetwork, pool: ClipPool, device: torch.device, *, clips: int = 48
+) -> dict[str, float]:
+    """Mean errors over the first ``clips`` of a pool: cold (frame 1) and warm (the others).
+
+    EPE in px; D1 and D3 in percent; ``cover`` is the share of pixels, in percent, whose error is
+    within sigma times ln 2: 50 where sigma is the scale of a Laplace distribution.
+    """
+    sums: dict[str, list[float]] = {}
+    limit = network.config.max_disparity_px
+    for start in range(0, min(clips, len(pool)), 8):
+        part = pool.clips(slice(start, start + 8))
+        for frame, estimate in enumerate(predict(network, part, device)):
+            truth = part.disparity_px[:, frame].to(device)
+            mask = known(truth, limit) > 0
+            errors = (estimate.disparity - truth).abs()[mask]
+            kind = "warm" if frame else "cold"
+            for name, value in measures(errors, estimate.sigma[mask]).items():
+                sums.setdefault(f"{kind}_{name}", []).append(value)
+    return {name: round(float(np.mean(values)), 4) for name, values in sums.items()}
+
+
+def measures(errors: Tensor, sigma: Tensor) -> dict[str, float]:
+    return {
+        "epe": errors.mean().item(),
+        "d1": 100 * (errors > 1).float().mean().item(),
+        "d3": 100 * (errors > 3).float().mean().item(),
+        "cover": 100 * (errors < sigma * np.log(2)).float().mean().item(),
+    }
+
+
+def save_picture(
+    network: StereoNetwork, pool: ClipPool, path: Path, device: torch.device, *, clips: int = 6
+) -> None:
+    """A PNG with a row per clip: left image, truth, estimate, error, sigma of its last frame."""
+    part = pool.clips(slice(0, clips))
+    last = predict(network, part, device)[-1]
+    rows = []
+    for index in range(len(part)):
+        image = part.left[index, -1].permute(1, 2, 0).numpy()[..., ::-1]
+        truth = part.disparity_px[index, -1].numpy()
+        estimate, sigma = (t[index].cpu().numpy() for t in (last.disparity, last.sigma))
+        top = max(float(truth.max()), 1.0)
+        error = np.where(truth > 0, np.abs(estimate - truth), 0)
+        panels = [truth / top, estimate / top, error / 4, sigma / 4]
+        painted = [cv2.applyColorMap(to_bytes(panel), cv2.COLORMAP_TURBO) for panel in panels]
+        rows.append(np.concatenate((image, *painted), axis=1))
+    cv2.imwrite(str(path), np.concatenate(rows, axis=0))
+
+
+def to_bytes(share: np.ndarray[tuple[int, ...], np.dtype[np.floating]]) -> np.ndarray:
+    return (np.clip(share, 0, 1) * 255).astype(np.uint8)

@@ -1,0 +1,138 @@
+"""Moving the state of the previous frame to the view of the current one.
+
+Everything happens in (u, v, d, 1): pixels and disparity of the left image, at full resolution,
+pixel centres at integers. A 4x4 matrix takes the previous frame's to the current frame's.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F  # noqa: N812  (the name the whole field uses)
+from torch import Tensor
+
+MIN_DISPARITY_PX = 0.05  # smaller ones are no surface a stereo camera can place
+
+
+def cell_centres(height: int, width: int, scale: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Full-resolution u [1, W] and v [H, 1] of the centres of cells of ``scale`` pixels."""
+    offset = (scale - 1) / 2
+    u = torch.arange(width, device=like.device).to(like.dtype)[None, :] * scale + offset
+    v = torch.arange(height, device=like.device).to(like.dtype)[:, None] * scale + offset
+    return u, v
+
+
+def transform_uvd(matrix: Tensor, u: Tensor, v: Tensor, d: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Apply ``matrix`` [B, 4, 4] to (u, v, d, 1), each [B, H, W]; points behind give d = 0."""
+    m = matrix[:, :, :, None, None]
+    x, y, z, w = (m[:, i, 0] * u + m[:, i, 1] * v + m[:, i, 2] * d + m[:, i, 3] for i in range(4))
+    in_front = (w > 1e-3).to(d.dtype)
+    scale = in_front / w.clamp(min=1e-3)
+    return x * scale, y * scale, z * scale
+
+
+def inverse_4x4(matrix: Tensor) -> Tensor:
+    """Inverse of [B, 4, 4] by Cayley-Hamilton: matrix products alone, which every runtime has."""
+    eye = torch.eye(4, dtype=matrix.dtype, device=matrix.device)
+
+    def trace(m: Tensor) -> Tensor:
+        return (m * eye).sum(dim=(1, 2), keepdim=True)
+
+    # Faddeev-LeVerrier: m1 = A - t1 I, m2 = A m1 - t2 I, ...; then A m3 = -c0 I.
+    m1 = matrix - trace(matrix) * eye
+    a1 = torch.matmul(matrix, m1)
+    m2 = a1 - trace(a1) / 2 * eye
+    a2 = torch.matmul(matrix, m2)
+    m3 = a2 - trace(a2) / 3 * eye
+    return m3 / (trace(torch.matmul(matrix, m3)) / 4)
+
+
+def splat_nearest(d: Tensor, column: Tensor, row: Tensor) -> Tensor:
+    """Scatter ``d`` [B, H, W] to integer cells; the nearest surface wins, 0 where nothing lands."""
+    batch, height, width = d.shape
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (d > MIN_DISPARITY_PX)
+    index = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
+    value = torch.where(inside, d, torch.zeros_like(d))
+    canvas = torch.zeros_like(value).flatten(1)
+    landed = canvas.scatter_reduce(1, index.flatten(1).long(), value.flatten(1), "amax")
+    return landed.view(batch, height, width)
+
+
+def fill_cracks(d: Tensor) -> Tensor:
+    """Close the one-cell cracks that forward splatting leaves: an empty cell takes the mean of its
+    neighbours when most of them are filled. [B, H, W]."""
+    filled = (d > 0).to(d.dtype)
+    both = F.avg_pool2d(torch.stack((d, filled), dim=1), 3, stride=1, padding=1)
+    mean = both[:, 0] / both[:, 1].clamp(min=1e-6)
+    return torch.where((filled < 0.5) & (both[:, 1] > 0.5), mean, d)
+
+
+def sample_nearest(features: Tensor, column: Tensor, row: Tensor) -> Tensor:
+    """Rows of ``features`` [B, C, H, W] at float cells [B, H', W'], clamped: [B, C, H', W']."""
+    batch, channels, height, width = features.shape
+    x = torch.floor(column + 0.5).clamp(0, width - 1)
+    y = torch.floor(row + 0.5).clamp(0, height - 1)
+    index = (y * width + x).long().flatten(1)[:, None].expand(-1, channels, -1)
+    picked = features.flatten(2).gather(2, index)
+    return picked.view(batch, channels, column.shape[1], column.shape[2])
+
+
+def sample_bilinear(features: Tensor, column: Tensor, row: Tensor) -> Tensor:
+    """Bilinear samples of ``features`` [B, C, H, W] at float cells [B, H', W'], clamped.
+
+    Four gathers instead of grid_sample, which is thirty times slower under onnxruntime.
+    """
+    height, width = features.shape[2:]
+    x = column.clamp(0, width - 1)
+    y = row.clamp(0, height - 1)
+    x0, y0 = torch.floor(x), torch.floor(y)
+    fx, fy = (x - x0)[:, None], (y - y0)[:, None]
+    top = sample_nearest(features, x0, y0) * (1 - fx) + sample_nearest(features, x0 + 1, y0) * fx
+    low = sample_nearest(features, x0, y0 + 1) * (1 - fx)
+    low = low + sample_nearest(features, x0 + 1, y0 + 1) * fx
+    return top * (1 - fy) + low * fy
+
+
+def warp_state(
+    disparity: Tensor, hidden: Tensor, uvd_curr_from_prev: Tensor, *, scale: int, hidden_scale: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Take the previous frame's disparity and hidden state to the current view.
+
+    Forward splat of the one-channel disparity finds which surface is seen where; from there each
+    cell looks back through the inverse transform and takes the disparity between cells and the
+    hidden state of the place it came from. So the many channels are gathered, never splatted, and
+    rounding to cells costs no accuracy.
+
+    Args: ``disparity`` [B, 1, H/s, W/s] px at full resolution, 0 = nothing; ``hidden``
+    [B, C, H/s', W/s']; ``uvd_curr_from_prev`` [B, 4, 4]. Returns prior disparity [B, 1, H/s, W/s]
+    (0 in holes), its hole mask (1 = nothing known), and the hidden state (0 in holes).
+    """
+    previous = disparity[:, 0]
+    _, height, width = previous.shape
+    u, v = cell_centres(height, width, scale, previous)
+    u_to, v_to, d_to = transform_uvd(uvd_curr_from_prev, u, v, previous)
+    d_to = d_to * (previous > MIN_DISPARITY_PX).to(d_to.dtype)
+    column = torch.floor((u_to + 0.5) / scale).clamp(-1, width)
+    row = torch.floor((v_to + 0.5) / scale).clamp(-1, height)
+    landed = fill_cracks(splat_nearest(d_to, column, row))
+    seen = (landed > MIN_DISPARITY_PX).to(landed.dtype)
+
+    # The inverse in double: a float32 product of pixel-sized entries would lose the sub-pixel part.
+    prev_from_curr = inverse_4x4(uvd_curr_from_prev.double()).to(previous.dtype)
+    u_from, v_from, d_from = transform_uvd(prev_from_curr, u, v, landed)
+    source_column = (u_from + 0.5) / scale - 0.5
+    source_row = (v_from + 0.5) / scale - 0.5
+    between = sample_bilinear(disparity, source_column, source_row)[:, 0]
+    # Between two surfaces the bilinear sample belongs to neither: keep what was splatted.
+    smooth = ((between - d_from).abs() < 1.0).to(landed.dtype)
+    _, _, refined = transform_uvd(uvd_curr_from_prev, u_from, v_from, between)
+    prior = (landed + smooth * (refined - landed)) * seen
+
+    step = hidden_scale // scale
+    low = F.max_pool2d(landed[:, None], step)[:, 0]
+    low_seen = (low > MIN_DISPARITY_PX).to(low.dtype)[:, None]
+    u_low, v_low = cell_centres(low.shape[1], low.shape[2], hidden_scale, low)
+    u_low, v_low, _ = transform_uvd(prev_from_curr, u_low, v_low, low)
+    carried = sample_bilinear(
+        hidden, (u_low + 0.5) / hidden_scale - 0.5, (v_low + 0.5) / hidden_scale - 0.5
+    )
+    return prior[:, None], 1 - seen[:, None], carried * low_seen
