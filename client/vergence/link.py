@@ -52,7 +52,7 @@ class Link:
         self._on_event = on_event
         self._outbox: asyncio.Queue[pb.StreamDepthRequest] = asyncio.Queue()
         self._ending = False
-        self.up = False
+        self.up = False  # a frame handed over now goes out at once
         self.round_trip_s: float | None = None
 
     @property
@@ -93,7 +93,6 @@ class Link:
 
     async def _converse(self, call: Call) -> ConnectionLost | None:
         """Send and receive until the call ends: None if that was asked for, else how it broke."""
-        self.up = True
         helpers = [asyncio.create_task(self._send_all(call)), asyncio.create_task(self._ping())]
         try:
             while (response := await call.receive()) is not None:
@@ -140,6 +139,7 @@ class Link:
             self.send(request)
         if self._ending:
             self.send(pb.StreamDepthRequest(end=pb.End()))
+        self.up = True
         return call
 
     async def _resume(self, lost: ConnectionLost) -> Call:
