@@ -170,6 +170,7 @@ class DepthEngine:
         max_age_s: float | None,
     ) -> "_Answer":
         started_s = self._clock()
+        skipped = stream.frames_skipped
         frame, view = await asyncio.to_thread(_decoded_view, decode, stream)
         decode_s = self._clock() - started_s
         stream.check_order(frame.frame_id)
@@ -179,8 +180,7 @@ class DepthEngine:
             Step(view, state, iterations),
             deadline_s=None if max_age_s is None else arrived_s + max_age_s,
         )
-        skipped = stream.frames_skipped
-        stream.commit(frame.frame_id, timed.result.state)
+        stream.commit(frame.frame_id, timed.result.state, frames_skipped=skipped)
         self.metrics.frames_stepped.labels(origin.name.lower()).inc()
         timings = Timings(
             decode_s=decode_s,

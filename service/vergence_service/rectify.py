@@ -101,7 +101,7 @@ def _pinhole(rig: StereoRig) -> tuple[list[Matrix], list[Matrix]]:
         _coefficients(rig.right),
         (rig.left.width, rig.left.height),
         right_from_left.rotation,
-        right_from_left.translation_m,
+        right_from_left.translation_m[:, None],
         flags=cv2.CALIB_ZERO_DISPARITY,
     )
     return _float64(left_projection, right_projection), _float64(left_rotation, right_rotation)
@@ -116,7 +116,7 @@ def _fisheye(rig: StereoRig) -> tuple[list[Matrix], list[Matrix]]:
         _coefficients(rig.right),
         (rig.left.width, rig.left.height),
         right_from_left.rotation,
-        right_from_left.translation_m,
+        right_from_left.translation_m[:, None],
         flags=cv2.CALIB_ZERO_DISPARITY,
     )
     return _float64(left_projection, right_projection), _float64(left_rotation, right_rotation)
@@ -133,7 +133,7 @@ def _maps(camera: Intrinsics, rotation: Matrix, rectified: Matrix) -> _Maps:
 
 
 def _coefficients(camera: Intrinsics) -> Matrix:
-    return np.array(camera.coefficients or (0.0, 0.0, 0.0, 0.0), np.float64)
+    return np.array(camera.coefficients or (0.0, 0.0, 0.0, 0.0), np.float64)[:, None]
 
 
 def _float64(*matrices: object) -> list[Matrix]:

@@ -96,11 +96,9 @@ class Settings(BaseSettings):
     log_level: Literal["debug", "info", "warning", "error"] = "info"
 
     def to_toml(self) -> str:
-        """As a file that says the same."""
-        values = self.model_dump(mode="json", exclude_none=True)
-        top = {key: value for key, value in values.items() if not isinstance(value, dict)}
-        sections = {key: value for key, value in values.items() if isinstance(value, dict)}
-        lines = _toml_lines(top)
+        """As a file that says the same, with what each key means."""
+        sections = {name: value for name, value in self if isinstance(value, _Section)}
+        lines = [f"log_level = {json.dumps(self.log_level)}"]
         for name, section in sections.items():
             lines += ["", f"[{name}]", *_toml_lines(section)]
         return "\n".join(lines) + "\n"
@@ -180,6 +178,9 @@ def _nested(flags: Mapping[str, Any]) -> dict[str, Any]:
     return nested
 
 
-def _toml_lines(values: Mapping[str, Any]) -> list[str]:
-    # Scalars and lists of strings are written alike in JSON and TOML.
-    return [f"{key} = {json.dumps(value)}" for key, value in values.items()]
+def _toml_lines(section: _Section) -> Iterable[str]:
+    # Scalars and lists of strings are written alike in JSON and TOML, which has no null.
+    for key, value in section.model_dump(mode="json").items():
+        meaning = type(section).model_fields[key].description
+        line = f"# {key} is not set" if value is None else f"{key} = {json.dumps(value)}"
+        yield f"{line}  # {meaning}" if meaning else line

@@ -109,12 +109,14 @@ class Stream:
         broken = break_between(self.state, view, limits)
         return (None, broken) if broken else (self.state, self.origin)
 
-    def commit(self, frame_id: int, state: RecurrentState) -> None:
+    def commit(self, frame_id: int, state: RecurrentState, *, frames_skipped: int) -> None:
+        """Frame ``frame_id`` was stepped, ``frames_skipped`` after the one before it."""
         self.state = state
         self.origin = Origin.WARM
         self.last_frame_id = frame_id
         self.frames_stepped += 1
-        self.frames_skipped = 0
+        # Those that were dropped while this one was in the model belong to the next.
+        self.frames_skipped -= frames_skipped
 
     def forget(self, reason: Origin) -> None:
         """The next step starts from nothing."""

@@ -13,27 +13,17 @@ RIG = RectifiedRig(
 FRAME_NS = 33_000_000  # between two frames
 
 
-def make_frame(
-    frame_id: int,
-    *,
-    brightness: int = 64,
-    rig: RectifiedRig = RIG,
-    pose: PoseSample | None | str = "moving",
-    capture_ns: int | None = None,
-) -> StereoFrame:
-    """One frame of a camera that moves sideways by a centimetre a frame over a textured wall."""
+def make_frame(frame_id: int, *, brightness: int = 64, rig: RectifiedRig = RIG) -> StereoFrame:
+    """One frame of a camera that moves sideways by a centimetre a frame past a textured wall."""
     rng = np.random.default_rng(brightness)
     left = rng.integers(0, 32, (rig.height, rig.width, 3), np.uint8)
     left[0, 0] = brightness
-    if pose == "moving":
-        pose = PoseSample(Pose(np.eye(3), np.array([0.01 * frame_id, 0.0, 0.0])))
-    assert not isinstance(pose, str)
     return StereoFrame(
         frame_id=frame_id,
-        capture_ns=frame_id * FRAME_NS if capture_ns is None else capture_ns,
+        capture_ns=frame_id * FRAME_NS,
         left=left,
         right=np.roll(left, -4, axis=1),
-        pose=pose,
+        pose=PoseSample(Pose(np.eye(3), np.array([0.01 * frame_id, 0.0, 0.0]))),
     )
 
 

@@ -66,6 +66,10 @@ class RecallModel:
         finally:
             self._free.set()
 
+    def let_go(self) -> None:
+        """Let the steps that are in the model end, before its block does."""
+        self._free.set()
+
     def wait_until_entered(self) -> None:
         """Block until one more step than before has reached the model."""
         assert self._entered.acquire(timeout=30)

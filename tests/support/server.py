@@ -60,7 +60,7 @@ class RawCall:
     async def receive(self) -> pb.StreamDepthResponse | None:
         """The next answer; None at the end. Raises grpc.aio.AioRpcError if it ends with one."""
         answer = await asyncio.wait_for(self.call.read(), PATIENCE_S)
-        return None if answer is grpc.aio.EOF else answer
+        return answer if isinstance(answer, pb.StreamDepthResponse) else None
 
     async def ask(self, message: pb.StreamDepthRequest) -> pb.StreamDepthResponse:
         await self.send(message)
@@ -72,7 +72,7 @@ class RawCall:
 @asynccontextmanager
 async def connected(server: Running) -> AsyncIterator[depth_pb2_grpc.DepthServiceStub]:
     async with grpc.aio.insecure_channel(server.grpc_address) as channel:
-        yield depth_pb2_grpc.DepthServiceStub(channel)
+        yield depth_pb2_grpc.DepthServiceStub(channel)  # type: ignore[no-untyped-call] # generated
 
 
 @asynccontextmanager

@@ -1,0 +1,139 @@
+"""Every waiter gets its own result or an exception, whatever else is in its batch."""
+
+import asyncio
+
+import numpy as np
+import pytest
+from prometheus_client import CollectorRegistry
+
+from tests.support.frames import RIG, make_frame
+from tests.support.models import RAISES, RecallModel
+from tests.support.server import ManualClock
+from vergence_proto.errors import Draining, FrameStale, ModelFailed
+from vergence_proto.geometry import RectifiedRig
+from vergence_service.batcher import StepBatcher, TimedResult
+from vergence_service.metrics import Metrics
+from vergence_service.model import Step, View
+
+
+def make_batcher(
+    model: RecallModel, *, max_batch: int = 8, clock: ManualClock | None = None
+) -> StepBatcher:
+    return StepBatcher(
+        model,
+        max_batch=max_batch,
+        clock=clock or ManualClock(),
+        metrics=Metrics(CollectorRegistry()),
+    )
+
+
+def make_step(brightness: int, *, rig: RectifiedRig = RIG, iterations: int = 1) -> Step:
+    frame = make_frame(1, brightness=brightness, rig=rig)
+    return Step(View(frame.left, frame.right, rig, frame.capture_ns), None, iterations)
+
+
+async def gathered_behind_another(
+    batcher: StepBatcher, model: RecallModel, steps: list[Step], **how: float
+) -> list[TimedResult | BaseException]:
+    """All of ``steps`` wait together while another one is in the model."""
+    with model.busy():
+        first = asyncio.create_task(batcher.step(make_step(1)))
+        await asyncio.to_thread(model.wait_until_entered)
+        waiting = [asyncio.create_task(batcher.step(step, **how)) for step in steps]
+        await asyncio.sleep(0)  # each runs up to its wait
+        model.batches.clear()
+    await first
+    return await asyncio.gather(*waiting, return_exceptions=True)
+
+
+async def test_rows_of_one_batch_get_their_own_results() -> None:
+    model = RecallModel()
+    steps = [make_step(brightness) for brightness in (10, 90, 200)]
+    async with make_batcher(model) as batcher:
+        together = await gathered_behind_another(batcher, model, steps)
+    assert model.batches == [3]
+    for step, timed in zip(steps, together, strict=True):
+        assert isinstance(timed, TimedResult)
+        np.testing.assert_array_equal(timed.result.offset_px, model.step([step])[0].offset_px)
+
+
+async def test_a_batch_holds_one_size_and_one_iteration_count() -> None:
+    model = RecallModel()
+    other_rig = RectifiedRig(32, 24, 30.0, 30.0, 15.5, 15.5, 11.5, 0.1)
+    steps = [
+        make_step(10),
+        make_step(20, rig=other_rig),
+        make_step(30),
+        make_step(40, iterations=4),
+        make_step(50, rig=other_rig),
+    ]
+    async with make_batcher(model) as batcher:
+        results = await gathered_behind_another(batcher, model, steps)
+    assert model.batches == [2, 2, 1]
+    assert all(isinstance(result, TimedResult) for result in results)
+
+
+async def test_a_batch_is_no_larger_than_allowed() -> None:
+    model = RecallModel()
+    async with make_batcher(model, max_batch=2) as batcher:
+        await gathered_behind_another(batcher, model, [make_step(i) for i in range(5)])
+    assert model.batches == [2, 2, 1]
+
+
+async def test_a_bad_row_does_not_fail_its_neighbours() -> None:
+    model = RecallModel()
+    steps = [make_step(brightness) for brightness in (50, RAISES, 70)]
+    async with make_batcher(model) as batcher:
+        outcomes = await gathered_behind_another(batcher, model, steps)
+    assert [type(outcome) for outcome in outcomes] == [TimedResult, ModelFailed, TimedResult]
+    assert "secret" not in str(outcomes[1])
+
+
+async def test_the_model_lives_on_after_a_failure() -> None:
+    async with make_batcher(RecallModel()) as batcher:
+        with pytest.raises(ModelFailed):
+            await batcher.step(make_step(RAISES))
+        assert isinstance(await batcher.step(make_step(1)), TimedResult)
+
+
+async def test_a_step_past_its_deadline_is_not_taken() -> None:
+    clock, model = ManualClock(), RecallModel()
+    async with make_batcher(model, clock=clock) as batcher:
+        with model.busy():
+            first = asyncio.create_task(batcher.step(make_step(1)))
+            await asyncio.to_thread(model.wait_until_entered)
+            late = asyncio.create_task(batcher.step(make_step(2), deadline_s=clock.now_s + 0.1))
+            patient = asyncio.create_task(batcher.step(make_step(3), deadline_s=clock.now_s + 9))
+            await asyncio.sleep(0)
+            clock.advance(0.2)
+        with pytest.raises(FrameStale, match=r"waited 0\.200 s"):
+            await late
+        assert (await patient).queue_s == pytest.approx(0.2)
+        await first
+    assert model.batches == [1, 1]
+
+
+async def test_a_caller_that_gives_up_does_not_stop_the_others() -> None:
+    model = RecallModel()
+    async with make_batcher(model) as batcher:
+        with model.busy():
+            impatient = asyncio.create_task(batcher.step(make_step(1)))
+            await asyncio.to_thread(model.wait_until_entered)
+            patient = asyncio.create_task(batcher.step(make_step(2)))
+            await asyncio.sleep(0)
+            impatient.cancel()
+        assert isinstance(await patient, TimedResult)
+    assert impatient.cancelled()
+
+
+async def test_waiters_are_told_when_the_batcher_ends() -> None:
+    model = RecallModel()
+    with model.busy():
+        async with make_batcher(model) as batcher:
+            in_the_model = asyncio.create_task(batcher.step(make_step(1)))
+            await asyncio.to_thread(model.wait_until_entered)
+            waiting = asyncio.create_task(batcher.step(make_step(2)))
+            await asyncio.sleep(0)
+            asyncio.get_running_loop().call_later(0.02, model.let_go)
+    outcomes = await asyncio.gather(in_the_model, waiting, return_exceptions=True)
+    assert [type(outcome) for outcome in outcomes] == [Draining, Draining]
