@@ -1,0 +1,180 @@
+"""The stream table under any sequence of events, against a model of a few lines."""
+
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import Bundle, RuleBasedStateMachine, invariant, rule
+from prometheus_client import CollectorRegistry
+
+from tests.support.frames import RIG
+from tests.support.server import ManualClock
+from vergence_proto.errors import (
+    DepthError,
+    StateMemory,
+    StreamExists,
+    StreamExpired,
+    StreamLimit,
+    Superseded,
+    UnknownStream,
+)
+from vergence_proto.types import StereoRig
+from vergence_service.metrics import Metrics
+from vergence_service.rectify import Rectifier
+from vergence_service.streams import Notice, Opening, Stream, StreamTable
+
+CAPACITY, MEMORY, STATE = 3, 1000, 400
+IDLE_S, NOTICE_S, GRACE_S, TOMBSTONE_S = 60.0, 10.0, 10.0, 300.0
+RIG_OPENING = Opening(StereoRig.from_rectified(RIG))
+RECTIFIER = Rectifier.of(RIG_OPENING.rig)
+
+
+class Connection:
+    """Records what it is told."""
+
+    def __init__(self) -> None:
+        self.notices: list[Notice] = []
+        self.errors: list[DepthError] = []
+
+    def notify(self, notice: Notice) -> None:
+        self.notices.append(notice)
+
+    def end(self, error: DepthError) -> None:
+        self.errors.append(error)
+
+
+class StreamTableMachine(RuleBasedStateMachine):
+    connections = Bundle("connections")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.clock = ManualClock()
+        self.registry = CollectorRegistry()
+        self.table = StreamTable(
+            capacity=CAPACITY,
+            max_state_bytes=MEMORY,
+            idle_timeout_s=IDLE_S,
+            idle_notice_s=NOTICE_S,
+            detach_grace_s=GRACE_S,
+            clock=self.clock,
+            metrics=Metrics(self.registry),
+        )
+        # What the table should hold: per open stream its size and since when it is unused; when
+        # each expired one expired; and who is attached to what.
+        self.sizes: dict[str, int] = {}
+        self.used_s: dict[str, float] = {}
+        self.expired_s: dict[str, float] = {}
+        self.owner: dict[str, Connection | None] = {}
+        self.streams: dict[str, Stream] = {}
+
+    def settle(self) -> None:
+        """Expire in the model what is due by now."""
+        for stream_id in list(self.sizes):
+            patience_s = IDLE_S if self.owner[stream_id] else GRACE_S
+            if self.clock.now_s >= self.used_s[stream_id] + patience_s:
+                self.forget(stream_id)
+                self.expired_s[stream_id] = self.clock.now_s
+
+    def forget(self, stream_id: str) -> None:
+        for table in (self.sizes, self.used_s, self.owner, self.streams):
+            table.pop(stream_id)  # type: ignore[attr-defined]
+
+    @rule(target=connections, stream_id=st.sampled_from("abcde"), size=st.sampled_from([1, STATE]))
+    def open(self, stream_id: str, size: int) -> Connection:
+        self.table.sweep()
+        self.settle()
+        connection = Connection()
+        expected: type[DepthError] | None = None
+        if stream_id in self.sizes:
+            expected = StreamExists
+        elif len(self.sizes) == CAPACITY:
+            expected = StreamLimit
+        elif sum(self.sizes.values()) + size > MEMORY:
+            expected = StateMemory
+        if expected is not None:
+            with pytest.raises(expected) as refusal:
+                self.table.open(
+                    stream_id, RIG_OPENING, RECTIFIER, state_bytes=size, attachment=connection
+                )
+            retry_s = refusal.value.retry_after_s
+            assert retry_s is None or 0 < retry_s <= IDLE_S
+            return connection
+        stream = self.table.open(
+            stream_id, RIG_OPENING, RECTIFIER, state_bytes=size, attachment=connection
+        )
+        self.sizes[stream_id] = size
+        self.used_s[stream_id] = self.clock.now_s
+        self.expired_s.pop(stream_id, None)
+        self.owner[stream_id] = connection
+        self.streams[stream_id] = stream
+        return connection
+
+    @rule(stream_id=st.sampled_from("abcde"))
+    def use(self, stream_id: str) -> None:
+        self.table.sweep()
+        self.settle()
+        if stream_id in self.sizes:
+            stream = self.table.get(stream_id)
+            assert stream is self.streams[stream_id]
+            self.table.touch(stream)
+            self.used_s[stream_id] = self.clock.now_s
+        else:
+            known = self.clock.now_s - self.expired_s.get(stream_id, -1e9) <= TOMBSTONE_S
+            with pytest.raises(StreamExpired if known else UnknownStream):
+                self.table.get(stream_id)
+
+    @rule(connection=connections)
+    def lose_connection(self, connection: Connection) -> None:
+        self.settle()
+        for stream_id, stream in self.streams.items():
+            self.table.detach(stream, connection)
+            if self.owner[stream_id] is connection:
+                self.owner[stream_id] = None
+                self.used_s[stream_id] = self.clock.now_s
+
+    @rule(target=connections, stream_id=st.sampled_from("abcde"), right_token=st.booleans())
+    def resume(self, stream_id: str, right_token: bool) -> Connection:
+        self.settle()
+        connection = Connection()
+        if stream_id not in self.sizes:
+            with pytest.raises((StreamExpired, UnknownStream)):
+                self.table.attach(stream_id, b"any", RIG_OPENING, connection)
+            return connection
+        stream, before = self.streams[stream_id], self.owner[stream_id]
+        if not right_token:
+            with pytest.raises(StreamExists):
+                self.table.attach(stream_id, b"guess", RIG_OPENING, connection)
+            assert stream.attachment is before
+            return connection
+        self.table.attach(stream_id, stream.resume_token, RIG_OPENING, connection)
+        if before is not None:
+            assert isinstance(before.errors[-1], Superseded)
+        self.owner[stream_id] = connection
+        self.used_s[stream_id] = self.clock.now_s
+        return connection
+
+    @rule(stream_id=st.sampled_from("abcde"))
+    def close(self, stream_id: str) -> None:
+        self.settle()
+        if stream_id in self.sizes:
+            self.table.close(self.streams[stream_id])
+            self.forget(stream_id)
+
+    @rule(seconds=st.sampled_from([1.0, 9.0, 11.0, 51.0, 61.0, 301.0]))
+    def wait(self, seconds: float) -> None:
+        self.clock.advance(seconds)
+
+    @invariant()
+    def the_table_holds_what_it_should(self) -> None:
+        self.table.sweep()
+        self.settle()
+        assert len(self.table) == len(self.sizes)
+        assert self.registry.get_sample_value("vergence_streams_open") == len(self.sizes)
+        assert self.registry.get_sample_value("vergence_state_bytes") == sum(self.sizes.values())
+        for stream_id, stream in self.streams.items():
+            assert stream.attachment is self.owner[stream_id]
+
+
+StreamTableMachine.TestCase.settings = settings(
+    max_examples=40, stateful_step_count=30, deadline=None
+)
+TestStreamTable = StreamTableMachine.TestCase
