@@ -123,7 +123,7 @@ class ClipPool:
 
 
 def _read(shard: _Shard, row: int) -> StereoClips:
-    images = torch.from_numpy(shard.images[row]).permute(1, 0, 4, 2, 3)
+    images = torch.from_numpy(np.array(shard.images[row])).permute(1, 0, 4, 2, 3)
     disparity = shard.disparity[row].astype(np.float32) / DISPARITY_SCALE
     width = disparity.shape[-1]
     visible = np.unpackbits(shard.visible[row], axis=-1, count=width).astype(bool)

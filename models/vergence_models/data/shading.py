@@ -17,7 +17,8 @@ from vergence_models.data.textures import TextureBank
 
 _CHUNK = 16384
 _MAX_ANISOTROPY = 6.0
-_SHADOW_BIAS = 0.02  # of the distance to the light
+_SHADOW_BIAS = 0.008  # of the distance to the light
+_SHADOW_LIFT = 0.015  # likewise, along the surface's normal
 FACES = 8  # surface index = primitive * FACES + face
 
 
@@ -164,7 +165,7 @@ def _lit(
         to_light = to_light * torch.rsqrt(squared)
         strength = _dot(normal, to_light).clamp(min=0) / (1 + squared * by_view[start + 6])
         if index == 0:
-            strength = strength * _unshadowed(hit, by_view, light, view)
+            strength = strength * _unshadowed(hit, normal, by_view, light, view)
         arriving = by_view[start + 3 : start + 6] * strength
         received = received + arriving
         middle = _unit(to_light + to_eye)
@@ -173,10 +174,15 @@ def _lit(
     return albedo * (received + material[13]) + gloss * material[10]
 
 
-def _unshadowed(hit: Tensor, by_view: Tensor, light: Illumination, view: Tensor) -> Tensor:
+def _unshadowed(
+    hit: Tensor, normal: Tensor, by_view: Tensor, light: Illumination, view: Tensor
+) -> Tensor:
     """The share of the first light that arrives, float32 [N]: 3x3 lookups around the hit."""
     resolution = light.shadow_depth_m.shape[-1]
-    x, y, z = to_local_point(by_view[_SHADOW : _SHADOW + 12], hit)
+    # Looked up a little above the surface, or surfaces nearly along the light shadow themselves.
+    distance = (hit - by_view[:3]).abs().amax(0)
+    lifted = hit + normal * (distance * _SHADOW_LIFT)
+    x, y, z = to_local_point(by_view[_SHADOW : _SHADOW + 12], lifted)
     depth = z.clamp(min=1e-3)
     u = x / depth * by_view[_SHADOW_FOCAL] + (resolution - 1) / 2
     v = y / depth * by_view[_SHADOW_FOCAL] + (resolution - 1) / 2
@@ -186,7 +192,7 @@ def _unshadowed(hit: Tensor, by_view: Tensor, light: Illumination, view: Tensor)
     u0, v0 = u.floor(), v.floor()
     fu, fv = u - u0, v - v0
     index = (light.scene[view] * resolution + v0.long()) * resolution + u0.long()
-    near = depth * (1 - _SHADOW_BIAS) - 0.01
+    near = depth * (1 - _SHADOW_BIAS)
     flat = light.shadow_depth_m.view(-1)
     weights_u, weights_v = (1 - fu, torch.ones_like(fu), fu), (1 - fv, torch.ones_like(fv), fv)
     lit = torch.zeros_like(u)
