@@ -9,6 +9,8 @@
     |-- FrameOutOfOrder, ModelChanged                    not in this state of the stream
     |-- StreamLimit, StateMemory, Quota, FrameTooLarge   more than the server gives
     |-- FrameStale                                       too late to be useful
+    |-- BadSequence, UploadTooLarge                      a whole sequence cannot be taken
+    |-- UnknownSequence, SequenceNotDone, QueueFull      its job is not there, or not yet
     |-- Draining, NotReady                               not now: try again, or elsewhere
     `-- ModelFailed, NonFinite                           the server's own failure
 
@@ -42,13 +44,18 @@ class ErrorCode(StrEnum):
     NOT_READY = "NOT_READY"
     MODEL_FAILED = "MODEL_FAILED"
     NON_FINITE = "NON_FINITE"
+    BAD_SEQUENCE = "BAD_SEQUENCE"
+    UPLOAD_TOO_LARGE = "UPLOAD_TOO_LARGE"
+    SEQUENCE_UNKNOWN = "SEQUENCE_UNKNOWN"
+    SEQUENCE_NOT_DONE = "SEQUENCE_NOT_DONE"
+    QUEUE_FULL = "QUEUE_FULL"
 
 
 ERROR_DOMAIN = "vergence"  # google.rpc.ErrorInfo.domain
 
 
 class DepthError(Exception):
-    """Base of everything a caller can be told about; ``retry_after_s`` is set where waiting helps."""
+    """Base of all a caller can be told about; ``retry_after_s`` is set where waiting helps."""
 
     code: ClassVar[ErrorCode]
 
@@ -169,6 +176,36 @@ class NonFinite(DepthError):
     """The model's result was not finite; the frame was dropped and the stream starts anew."""
 
     code = ErrorCode.NON_FINITE
+
+
+class BadSequence(DepthError):
+    """An upload does not unpack, or what it holds is no sequence in a layout that is read."""
+
+    code = ErrorCode.BAD_SEQUENCE
+
+
+class UploadTooLarge(DepthError):
+    """An upload is larger than allowed, as it travels or once it is unpacked."""
+
+    code = ErrorCode.UPLOAD_TOO_LARGE
+
+
+class UnknownSequence(DepthError):
+    """There is no job of this id: it never was, was deleted, or its results have expired."""
+
+    code = ErrorCode.SEQUENCE_UNKNOWN
+
+
+class SequenceNotDone(DepthError):
+    """The job has no results: it waits, runs, or failed."""
+
+    code = ErrorCode.SEQUENCE_NOT_DONE
+
+
+class QueueFull(DepthError):
+    """As many sequences wait as may, or there is no room on disk for another one."""
+
+    code = ErrorCode.QUEUE_FULL
 
 
 ERROR_CLASSES: dict[ErrorCode, type[DepthError]] = {

@@ -26,17 +26,19 @@ class _Waiting:
     step: Step
     since_s: float
     deadline_s: float | None
+    live: bool
     answer: asyncio.Future[TimedResult]
 
     @property
     def shape_of_work(self) -> tuple[object, ...]:
         """Rows can share a batch if this is equal."""
-        return self.step.view.left.shape, self.step.iterations
+        return self.live, self.step.view.left.shape, self.step.iterations
 
 
 class StepBatcher:
     """Gathers the steps that wait for the model and runs them together, oldest first.
 
+    Live steps come before all others, which fill the gaps that they leave, in batches of their own.
     Every waiter gets a result or an exception: ModelFailed, NonFinite, FrameStale, or Draining
     when the batcher ends first. A caller never has two steps of one stream waiting.
     """
@@ -73,10 +75,12 @@ class StepBatcher:
         loop = asyncio.get_running_loop()
         await loop.run_in_executor(self._thread, self._model.warm_up, iterations)
 
-    async def step(self, step: Step, *, deadline_s: float | None = None) -> TimedResult:
+    async def step(
+        self, step: Step, *, deadline_s: float | None = None, live: bool = True
+    ) -> TimedResult:
         """The result of one step; FrameStale if the model was not free before ``deadline_s``."""
         answer: asyncio.Future[TimedResult] = asyncio.get_running_loop().create_future()
-        self._waiting.append(_Waiting(step, self._clock(), deadline_s, answer))
+        self._waiting.append(_Waiting(step, self._clock(), deadline_s, live, answer))
         self._arrived.set()
         return await answer
 
@@ -102,7 +106,7 @@ class StepBatcher:
                         "maximum age; the stream is as it was"
                     )
                 )
-        wanted = _wanted(wanted)
+        wanted = sorted(_wanted(wanted), key=lambda item: not item.live)  # stable: oldest first
         work = wanted[0].shape_of_work if wanted else None
         batch = [item for item in wanted if item.shape_of_work == work][: self._max_batch]
         self._waiting = [item for item in wanted if item not in batch]

@@ -19,10 +19,12 @@ from vergence_proto.errors import (
 from vergence_proto.geometry import Pose
 from vergence_proto.model_io import ModelCard
 from vergence_proto.types import (
+    Delivery,
     DisparityMap,
     Origin,
     Plane,
     StereoFrame,
+    StereoRig,
     Timings,
 )
 from vergence_service.batcher import StepBatcher, TimedResult
@@ -84,15 +86,8 @@ class DepthEngine:
         self, stream_id: str, opening: Opening, attachment: Attachment | None = None
     ) -> Stream:
         """Raises NotReady, Draining, BadCalibration, FrameTooLarge, and as StreamTable.open."""
-        if self._refusal is not None:
-            raise self._refusal
-        width, height = opening.rig.left.width, opening.rig.left.height
-        if width * height > self.max_pixels:
-            raise FrameTooLarge(
-                f"expected at most {self.max_pixels} pixels an image, got {width}x{height}"
-            )
-        rectifier = await asyncio.to_thread(Rectifier.of, opening.rig)
-        reserve = state_bytes(self.card, height, width)
+        rectifier = await self._rectifier(opening.rig)
+        reserve = state_bytes(self.card, rectifier.rig.height, rectifier.rig.width)
         return self.streams.open(
             stream_id, opening, rectifier, state_bytes=reserve, attachment=attachment
         )
@@ -122,6 +117,29 @@ class DepthEngine:
         """
         stream = self.streams.get(stream_id)
         self.streams.touch(stream)
+        return await self._step(stream, decode, arrived_s=arrived_s, max_age_s=max_age_s)
+
+    async def open_apart(self, opening: Opening) -> Stream:
+        """A stream that nobody attaches to, for a sequence that is known from its first frame on.
+
+        It is in no table: it takes no place from live streams, and ends with its last reference.
+        Raises NotReady, Draining, BadCalibration, FrameTooLarge.
+        """
+        rectifier = await self._rectifier(opening.rig)
+        return Stream("", b"", opening, rectifier, 0, None, self._clock())
+
+    async def step_apart(self, stream: Stream, decode: Callable[[], StereoFrame]) -> DisparityMap:
+        """As :meth:`step`, of a stream that :meth:`open_apart` made."""
+        return await self._step(stream, decode, arrived_s=self._clock(), max_age_s=None)
+
+    async def _step(
+        self,
+        stream: Stream,
+        decode: Callable[[], StereoFrame],
+        *,
+        arrived_s: float,
+        max_age_s: float | None,
+    ) -> DisparityMap:
         # The lock wakes its waiters in order, so a stream takes its frames one at a time as they
         # arrived, and no batch ever holds two frames of one stream.
         async with stream.turn:
@@ -162,6 +180,16 @@ class DepthEngine:
         if stream.attachment is not None:
             stream.attachment.end(UnknownStream(f"stream {stream_id!r} was closed"))
 
+    async def _rectifier(self, rig: StereoRig) -> Rectifier:
+        if self._refusal is not None:
+            raise self._refusal
+        width, height = rig.left.width, rig.left.height
+        if width * height > self.max_pixels:
+            raise FrameTooLarge(
+                f"expected at most {self.max_pixels} pixels an image, got {width}x{height}"
+            )
+        return await asyncio.to_thread(Rectifier.of, rig)
+
     async def _advance(
         self,
         stream: Stream,
@@ -179,6 +207,7 @@ class DepthEngine:
         timed = await self._batcher.step(
             Step(view, state, iterations),
             deadline_s=None if max_age_s is None else arrived_s + max_age_s,
+            live=stream.opening.delivery is Delivery.NEWEST,
         )
         stream.commit(frame.frame_id, timed.result.state, frames_skipped=skipped)
         self.metrics.frames_stepped.labels(origin.name.lower()).inc()

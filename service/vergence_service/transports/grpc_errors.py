@@ -39,6 +39,11 @@ GRPC_STATUS: Mapping[ErrorCode, grpc.StatusCode] = {
     ErrorCode.NOT_READY: grpc.StatusCode.UNAVAILABLE,
     ErrorCode.MODEL_FAILED: grpc.StatusCode.INTERNAL,
     ErrorCode.NON_FINITE: grpc.StatusCode.INTERNAL,
+    ErrorCode.BAD_SEQUENCE: grpc.StatusCode.INVALID_ARGUMENT,
+    ErrorCode.UPLOAD_TOO_LARGE: grpc.StatusCode.RESOURCE_EXHAUSTED,
+    ErrorCode.SEQUENCE_UNKNOWN: grpc.StatusCode.NOT_FOUND,
+    ErrorCode.SEQUENCE_NOT_DONE: grpc.StatusCode.FAILED_PRECONDITION,
+    ErrorCode.QUEUE_FULL: grpc.StatusCode.RESOURCE_EXHAUSTED,
 }
 
 
