@@ -20,16 +20,17 @@ DEFAULT_SERVER = "grpc://127.0.0.1:50051"
 class DepthClient:
     """A connection to a server; connects when it is first needed.
 
-    ``server`` is ``grpc://HOST:PORT``. Every method raises NotReady (ConnectionLost) where the
-    server cannot be reached, and otherwise the class of :mod:`vergence_proto.errors` that the
-    server raised. Use it inside ``async with``, from one event loop.
+    ``server`` is ``grpc://HOST:PORT``; anything else is a ValueError. Every method raises NotReady
+    (ConnectionLost) where the server cannot be reached, and otherwise the class of
+    :mod:`vergence_proto.errors` that the server raised. Use it inside ``async with``, from one
+    event loop.
     """
 
     def __init__(self, server: str = DEFAULT_SERVER) -> None:
-        self._server = server
+        self._address = _grpc_address(server)
 
     async def __aenter__(self) -> Self:
-        self._transport = _transport_to(self._server)
+        self._transport: Transport = GrpcTransport(self._address)
         return self
 
     async def __aexit__(self, *exc_info: object) -> None:
@@ -112,10 +113,10 @@ class DepthClient:
         await self._transport.ask("CloseStream", request, pb.CloseStreamResponse)
 
 
-def _transport_to(server: str) -> Transport:
-    scheme, separator, address = server.partition("://")
-    if not separator:
-        scheme, address = "grpc", server
-    if scheme != "grpc" or not address:
+def _grpc_address(server: str) -> str:
+    scheme, separator, address = server.rpartition("://")
+    host, colon, port = address.rpartition(":")
+    known = scheme == ("grpc" if separator else "")
+    if not (known and host and colon and port.isdecimal()):
         raise ValueError(f"expected a server as grpc://HOST:PORT, got {server!r}")
-    return GrpcTransport(address)
+    return address

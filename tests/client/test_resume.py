@@ -3,11 +3,13 @@
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.client.proxy import Proxy, proxy_to
+from tests.client.waiting import eventually
 from tests.support.frames import RIG, make_frame
 from tests.support.models import RecallModel
 from tests.support.server import ManualClock, running_server
@@ -44,15 +46,14 @@ class Scene:
         )
 
     async def until(self, kind: EventKind) -> None:
-        while kind not in [event.kind for event in self.events]:
-            await asyncio.sleep(0.01)
+        await eventually(lambda: kind in [event.kind for event in self.events])
 
 
 @asynccontextmanager
-async def scene(**flags: object) -> AsyncIterator[Scene]:
+async def scene(*, clock: ManualClock | None = None, **flags: Any) -> AsyncIterator[Scene]:
     model = RecallModel()
     async with (
-        running_server(model, **flags) as server,
+        running_server(model, clock=clock, **flags) as server,
         proxy_to(server.grpc_address) as proxy,
         DepthClient(proxy.address) as client,
     ):
@@ -147,14 +148,16 @@ async def test_live_frames_in_flight_are_counted_lost_and_the_next_ones_go_throu
 
 
 async def test_beyond_the_grace_it_gives_up_and_says_so() -> None:
-    async with scene(streams__detach_grace_s=0.3) as rough:
-        async with rough.open_session(Delivery.EVERY) as session:
-            await step(session, 1)
-            rough.proxy.cut()
-            with pytest.raises(ConnectionLost, match=r"again in 0\.3 s"):
-                await step(session, 2)
-            with pytest.raises(ConnectionLost):
-                await anext(session)
+    async with (
+        scene(streams__detach_grace_s=0.3) as rough,
+        rough.open_session(Delivery.EVERY) as session,
+    ):
+        await step(session, 1)
+        rough.proxy.cut()
+        with pytest.raises(ConnectionLost, match=r"again in 0\.3 s"):
+            await step(session, 2)
+        with pytest.raises(ConnectionLost):
+            await anext(session)
 
 
 async def test_a_stream_that_expired_meanwhile_is_told_as_that() -> None:
@@ -170,13 +173,17 @@ async def test_a_stream_that_expired_meanwhile_is_told_as_that() -> None:
 
 
 async def test_a_server_that_restarted_has_forgotten_the_stream() -> None:
-    async with running_server(RecallModel()) as second:
-        async with running_server(RecallModel()) as first, proxy_to(first.grpc_address) as proxy:
-            async with DepthClient(proxy.address) as client, client.open_session(RIG) as session:
-                await step(session, 1)
-                proxy.lead_to(second.grpc_address)
-                with pytest.raises(UnknownStream):
-                    await step(session, 2)
+    async with (
+        running_server(RecallModel()) as first,
+        running_server(RecallModel()) as second,
+        proxy_to(first.grpc_address) as proxy,
+        DepthClient(proxy.address) as client,
+        client.open_session(RIG) as session,
+    ):
+        await step(session, 1)
+        proxy.lead_to(second.grpc_address)
+        with pytest.raises(UnknownStream):
+            await step(session, 2)
 
 
 async def test_no_server_is_told_at_once_and_by_its_address() -> None:

@@ -6,6 +6,7 @@ from collections.abc import AsyncIterator
 import numpy as np
 import pytest
 
+from tests.client.waiting import eventually
 from tests.support.frames import FRAME_NS, RIG, make_frame
 from tests.support.models import RAISES, RecallModel
 from tests.support.server import ManualClock, running_server
@@ -55,13 +56,13 @@ async def client(server: Running) -> AsyncIterator[DepthClient]:
         yield client
 
 
-async def step(session: DepthSession, frame_id: int, **make: int) -> DepthResult:
-    frame = make_frame(frame_id, **make)
+async def step(session: DepthSession, frame_id: int, brightness: int = 64) -> DepthResult:
+    frame = make_frame(frame_id, brightness=brightness)
     return await session.step(frame.left, frame.right, frame.pose, capture_ns=frame.capture_ns)
 
 
-def submit(session: DepthSession, frame_id: int, **make: int) -> int | None:
-    frame = make_frame(frame_id, **make)
+def submit(session: DepthSession, frame_id: int, brightness: int = 64) -> int | None:
+    frame = make_frame(frame_id, brightness=brightness)
     return session.submit(frame.left, frame.right, frame.pose, capture_ns=frame.capture_ns)
 
 
@@ -134,11 +135,11 @@ async def test_grey_images_are_as_good_as_colour_with_equal_channels(
     client: DepthClient, encoding: ImageEncoding
 ) -> None:
     frame = make_frame(1)
-    grey_left, grey_right = frame.left[..., 0], frame.right[..., 0]
+    left, right = frame.left[..., 0], frame.right[..., 0]
     async with client.open_session(RIG, output=EXACT, encoding=encoding) as session:
-        grey = await session.step(grey_left, grey_right)
+        grey = await session.step(left, right)
         session.reset()
-        colour = await session.step(*(np.dstack([side] * 3) for side in (grey_left, grey_right)))
+        colour = await session.step(np.dstack([left] * 3), np.dstack([right] * 3))
     np.testing.assert_array_equal(grey.disparity_px, colour.disparity_px)
 
 
@@ -184,8 +185,7 @@ async def test_a_newer_frame_displaces_one_that_waits_and_every_frame_is_account
             await asyncio.to_thread(model.wait_until_entered)
             for frame_id in (2, 3, 4, 5, 6):
                 submit(session, frame_id)
-            while session.drops.displaced < 3:
-                await asyncio.sleep(0.01)
+            await eventually(lambda: session.drops.displaced == 3)
         results = [await anext(session) for _ in range(2)]
     assert [result.frame_id for result in results] == [1, 5]
     assert (session.drops.at_source, session.drops.displaced) == (1, 3)
@@ -329,8 +329,7 @@ async def test_an_idle_stream_expires_after_a_notice() -> None:
         client.open_session(RIG, on_event=events.append) as session,
     ):
         clock.advance(55)
-        while not events:
-            await asyncio.sleep(0.01)
+        await eventually(lambda: events)
         clock.advance(10)
         with pytest.raises(StreamExpired):
             await anext(session)

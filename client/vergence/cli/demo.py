@@ -57,7 +57,7 @@ async def demo(
                     progress.update(bar, advance=1, note=f"{1e3 * answered.latency_s:.0f} ms")
             report.seconds = time.monotonic() - started_s
     for answered in answers:
-        report.add(answered.latency_s, accuracy_of(answered))
+        report.add(answered.latency_s, answered.result.timings.model_s, accuracy_of(answered))
     _draw(source, title, [row_of(answered) for answered in answers], out, console)
     console.print(report.as_table(title))
     if json is not None:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from vergence.client import DepthClient
 from vergence_proto.errors import DepthError
@@ -46,7 +47,8 @@ async def doctor(server: str, console: Console) -> bool:
     findings = [_python(), *_packages(), *_ports(), _weights(), await _reachable(server)]
     table = Table(show_header=False, box=None)
     for finding in findings:
-        table.add_row(finding.verdict.value, finding.what, finding.detail)
+        # As text: the brackets of an extra are not markup.
+        table.add_row(finding.verdict.value, Text(finding.what), Text(finding.detail))
     console.print(table)
     return all(finding.verdict is not Verdict.BAD for finding in findings)
 

@@ -13,7 +13,7 @@ from vergence.cli.demo import bundled_sample, demo
 from vergence.cli.doctor import doctor
 from vergence.cli.run import run
 from vergence.cli.trouble import Trouble
-from vergence.client import DEFAULT_SERVER
+from vergence.client import DEFAULT_SERVER, DepthClient
 from vergence_proto.errors import DepthError
 
 app = typer.Typer(
@@ -50,6 +50,15 @@ def _print_version(wanted: bool) -> None:
         raise typer.Exit
 
 
+def _checked_server(server: str | None) -> str | None:
+    if server is not None:
+        try:
+            DepthClient(server)
+        except ValueError as error:
+            raise typer.BadParameter(str(error)) from None
+    return server
+
+
 @app.callback()
 def _vergence(
     version: Annotated[
@@ -74,7 +83,10 @@ def _demo(
 def _run(
     source: Annotated[str, typer.Argument(help="KIND:PATH, as vergence:DIR or kitti:DIR.")],
     server: Annotated[
-        str | None, typer.Option(help="HOST:PORT of a running server; else one is started.")
+        str | None,
+        typer.Option(
+            help="HOST:PORT of a running server; else one is started.", callback=_checked_server
+        ),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Where disparity goes (default: vergence-run/NAME).")
@@ -110,7 +122,9 @@ def _run(
 
 @app.command("doctor")
 def _doctor(
-    server: Annotated[str, typer.Option(help="HOST:PORT to look for.")] = DEFAULT_SERVER,
+    server: Annotated[
+        str, typer.Option(help="HOST:PORT to look for.", callback=_checked_server)
+    ] = DEFAULT_SERVER,
 ) -> None:
     """Tell what is installed, what is missing, and whether a server answers."""
     if not asyncio.run(doctor(server, Console())):

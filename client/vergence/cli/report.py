@@ -1,6 +1,6 @@
 """What a run amounts to: speed, and accuracy where the truth is known."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,12 +15,14 @@ class Report:
     """Filled while frames come back; ``seconds`` is the time from the first to the last of them."""
 
     latencies_s: list[float] = field(default_factory=list)
+    model_s: list[float] = field(default_factory=list)
     accuracies: list[Accuracy] = field(default_factory=list)
     seconds: float = 0.0
     drops: Drops = field(default_factory=Drops)
 
-    def add(self, latency_s: float, accuracy: Accuracy | None) -> None:
+    def add(self, latency_s: float, model_s: float, accuracy: Accuracy | None) -> None:
         self.latencies_s.append(latency_s)
+        self.model_s.append(model_s)
         if accuracy is not None:
             self.accuracies.append(accuracy)
 
@@ -32,7 +34,7 @@ class Report:
 
     def as_json(self) -> Mapping[str, float | int | None]:
         """The keys that other programs read; accuracy is null where no truth is known."""
-        p50_ms, p95_ms = self._percentiles_ms()
+        p50_ms, p95_ms = _percentiles_ms(self.latencies_s)
         mean = self.accuracy
         return {
             "frames": len(self.latencies_s),
@@ -50,7 +52,8 @@ class Report:
         return len(self.latencies_s) / self.seconds if self.seconds > 0 else 0.0
 
     def as_table(self, title: str) -> Table:
-        p50_ms, p95_ms = self._percentiles_ms()
+        p50_ms, p95_ms = _percentiles_ms(self.latencies_s)
+        model_ms, _ = _percentiles_ms(self.model_s)
         table = Table(title=title, title_justify="left", show_header=False)
         table.add_column(style="bold")
         table.add_column(justify="right")
@@ -60,18 +63,21 @@ class Report:
             table.add_row("dropped", str(self.drops.total), _told(self.drops))
         table.add_row("fps", f"{self.fps:.1f}", "end to end")
         table.add_row("latency p50", f"{p50_ms:.1f} ms", "from sending a frame to its depth")
-        table.add_row("latency p95", f"{p95_ms:.1f} ms", "")
+        table.add_row("latency p95", f"{p95_ms:.1f} ms")
+        table.add_row("model p50", f"{model_ms:.1f} ms", "the network's share of it")
         if mean := self.accuracy:
             table.add_row("EPE", f"{mean.epe_px:.2f} px", "mean absolute error of disparity")
             table.add_row("D1", f"{mean.d1_pct:.1f} %", "pixels off by more than 1 px")
             table.add_row("D3", f"{mean.d3_pct:.1f} %", "by more than 3 px")
         return table
 
-    def _percentiles_ms(self) -> tuple[float, float]:
-        if not self.latencies_s:
-            return 0.0, 0.0
-        p50_s, p95_s = np.percentile(self.latencies_s, (50, 95))
-        return 1e3 * float(p50_s), 1e3 * float(p95_s)
+
+def _percentiles_ms(seconds: Sequence[float]) -> tuple[float, float]:
+    """The median, and what 95 % stay below."""
+    if not seconds:
+        return 0.0, 0.0
+    p50_s, p95_s = np.percentile(seconds, (50, 95))
+    return 1e3 * float(p50_s), 1e3 * float(p95_s)
 
 
 def _told(drops: Drops) -> str:

@@ -136,7 +136,7 @@ async def _stream(
 
     async def settle() -> None:
         answered, found = await writing.popleft()
-        report.add(answered.latency_s, found)
+        report.add(answered.latency_s, answered.result.timings.model_s, found)
         written.keep(answered)
 
     with progress_bar(console) as progress:

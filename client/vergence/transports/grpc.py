@@ -115,4 +115,6 @@ def _error_from_rpc(error: grpc.aio.AioRpcError, address: str) -> DepthError:
         return FrameTooLarge(f"{address} refused the message: {details}")
     if code is grpc.StatusCode.UNIMPLEMENTED:
         return NotReady(f"{address} speaks gRPC but does not offer vergence.v1: {details}")
-    return ConnectionLost(f"no connection to {address} ({code.name}): {details}")
+    # The end of gRPC's sentence is the part that tells something.
+    reason = (details or code.name).rpartition("last error: ")[2].removeprefix("UNKNOWN: ")
+    return ConnectionLost(f"no connection to {address}: {reason}")
