@@ -146,7 +146,7 @@ class RectifiedRig:
         return np.where(positive, depth, np.float32(np.nan))
 
     def disparity_from_depth(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """d = fx * baseline / Z, pixels; NaN where the depth is not positive."""
+        """D = fx * baseline / Z, pixels; NaN where the depth is not positive."""
         return self.depth_from_disparity(depth_m)  # the map is its own inverse
 
     @property

@@ -101,16 +101,17 @@ def load_model_card(weights_dir: Path, name: str) -> ModelCard:
     if name not in models:
         raise ManifestError(f"{path} has no model {name!r}; it has {', '.join(sorted(models))}")
     entry = models[name]
+    graphs = {int(count): weights_dir / graph["file"] for count, graph in entry["graphs"].items()}
     digests = {
-        int(count): _checked_digest(weights_dir / graph["file"], graph["sha256"])
-        for count, graph in entry["graphs"].items()
+        count: _checked_digest(path, entry["graphs"][str(count)]["sha256"])
+        for count, path in graphs.items()
     }
     return ModelCard(
         name=name,
         stride=entry["stride"],
         max_disparity_px=entry["max_disparity_px"],
         state=tuple(StateTensor(**tensor) for tensor in entry["state"]),
-        graphs={int(count): weights_dir / graph["file"] for count, graph in entry["graphs"].items()},
+        graphs=graphs,
         weights_sha256=hashlib.sha256(
             b"".join(digests[count] for count in sorted(digests))
         ).hexdigest(),
