@@ -210,12 +210,14 @@ class Ping(_message.Message):
     def __init__(self, client_ns: _Optional[int] = ...) -> None: ...
 
 class Pong(_message.Message):
-    __slots__ = ("client_ns", "server_hold_ns")
+    __slots__ = ("client_ns", "server_hold_ns", "unanswered_frame_ids")
     CLIENT_NS_FIELD_NUMBER: _ClassVar[int]
     SERVER_HOLD_NS_FIELD_NUMBER: _ClassVar[int]
+    UNANSWERED_FRAME_IDS_FIELD_NUMBER: _ClassVar[int]
     client_ns: int
     server_hold_ns: int
-    def __init__(self, client_ns: _Optional[int] = ..., server_hold_ns: _Optional[int] = ...) -> None: ...
+    unanswered_frame_ids: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, client_ns: _Optional[int] = ..., server_hold_ns: _Optional[int] = ..., unanswered_frame_ids: _Optional[_Iterable[int]] = ...) -> None: ...
 
 class Notice(_message.Message):
     __slots__ = ("kind", "message", "in_s")
