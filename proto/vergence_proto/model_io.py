@@ -1,24 +1,20 @@
 """The contract between whoever exports a network and whoever serves it.
 
 A model is a set of ONNX graphs over the same weights, one per iteration count, and a manifest
-that describes them. One run of a graph is one step of the recurrence, for a batch of streams:
+that describes them. One run of a graph is one step of the recurrence, for a batch of streams.
 
-=======================  ================  ==========================================================
-input                    type, shape       meaning
-=======================  ================  ==========================================================
-``left``, ``right``      uint8 [B,H,W,3]   rectified RGB; H and W are multiples of the model's stride
-``uvd_curr_from_prev``   float32 [B,4,4]   pixels of the previous frame to pixels of this one, see
-                                           :func:`vergence_proto.geometry.uvd_curr_from_prev`
-``prev_<tensor>``        float32 [B,C,h,w]  the state the previous step left; zeros on a cold start
-=======================  ================  ==========================================================
+Inputs:
 
-=======================  ================  ==========================================================
-output                   type, shape       meaning
-=======================  ================  ==========================================================
-``disparity``            float32 [B,H,W]   pixel offset u_left - u_right, in full-resolution pixels
-``sigma``                float32 [B,H,W]   its expected absolute error, in pixels
-``next_<tensor>``        float32 [B,C,h,w]  the state for the next step
-=======================  ================  ==========================================================
+- ``left``, ``right``: uint8 [B, H, W, 3], rectified RGB; H and W are multiples of the stride.
+- ``uvd_curr_from_prev``: float32 [B, 4, 4], pixels of the previous frame to pixels of this one;
+  see :func:`vergence_proto.geometry.uvd_curr_from_prev`.
+- ``prev_<tensor>``: float32 [B, C, h, w], the state the previous step left; zeros on a cold start.
+
+Outputs:
+
+- ``disparity``: float32 [B, H, W], the pixel offset u_left - u_right, in full-resolution pixels.
+- ``sigma``: float32 [B, H, W], its expected absolute error, in pixels.
+- ``next_<tensor>``: float32 [B, C, h, w], the state for the next step.
 
 Pixel centres sit at integer coordinates. The matched quantity is the raw pixel offset, also where
 the two principal points differ: the transform carries that difference.
