@@ -165,6 +165,9 @@ class OnnxStereoModel:
         self._providers = [_available(provider) for provider in providers]
         self._options = onnxruntime.SessionOptions()
         self._options.intra_op_num_threads = threads
+        # Planning the reuse of buffers took a second of a long graph's start and saved no memory:
+        # the arena gives freed buffers out again without a plan, and steps are as quick.
+        self._options.enable_mem_reuse = False
         self._options.add_session_config_entry(
             "session.intra_op.allow_spinning", "1" if allow_spinning else "0"
         )

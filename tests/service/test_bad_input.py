@@ -8,6 +8,7 @@ import cv2
 import grpc
 import numpy as np
 import pytest
+from google.protobuf.message import Message
 from google.rpc import error_details_pb2
 from grpc_status import rpc_status
 
@@ -28,16 +29,21 @@ def test_every_error_code_has_a_grpc_status() -> None:
     assert set(GRPC_STATUS) == set(ErrorCode)
 
 
+def unpack_detail(error: grpc.aio.AioRpcError, detail: Message) -> None:
+    """Fill ``detail`` from the one of its kind in the error's rich status."""
+    status = rpc_status.from_call(error)  # type: ignore[arg-type] # its stubs know only sync calls
+    assert status is not None
+    assert status.message == error.details()
+    [packed] = [one for one in status.details if one.Is(detail.DESCRIPTOR)]
+    packed.Unpack(detail)
+
+
 def reason_of(error: grpc.aio.AioRpcError) -> str:
     """The ErrorInfo reason of a failed call."""
-    status = rpc_status.from_call(error)
-    assert status is not None
     info = error_details_pb2.ErrorInfo()
-    [packed] = [detail for detail in status.details if detail.Is(info.DESCRIPTOR)]
-    packed.Unpack(info)
+    unpack_detail(error, info)
     assert info.domain == ERROR_DOMAIN
-    assert status.message == error.details()
-    return info.reason
+    return str(info.reason)
 
 
 def truncated_jpeg(frame: pb.Frame) -> None:
@@ -253,11 +259,8 @@ async def test_a_full_server_says_when_to_come_back() -> None:
         with pytest.raises(grpc.aio.AioRpcError) as failure:
             await RawCall(stub.StreamDepth()).ask(open_message())
     assert reason_of(failure.value) == "STREAM_LIMIT"
-    status = rpc_status.from_call(failure.value)
-    assert status is not None
     retry = error_details_pb2.RetryInfo()
-    [packed] = [detail for detail in status.details if detail.Is(retry.DESCRIPTOR)]
-    packed.Unpack(retry)
+    unpack_detail(failure.value, retry)
     assert 0 < retry.retry_delay.seconds <= 60
 
 

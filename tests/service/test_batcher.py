@@ -33,13 +33,13 @@ def make_step(brightness: int, *, rig: RectifiedRig = RIG, iterations: int = 1) 
 
 
 async def gathered_behind_another(
-    batcher: StepBatcher, model: RecallModel, steps: list[Step], **how: float
+    batcher: StepBatcher, model: RecallModel, steps: list[Step]
 ) -> list[TimedResult | BaseException]:
     """All of ``steps`` wait together while another one is in the model."""
     with model.busy():
         first = asyncio.create_task(batcher.step(make_step(1)))
         await asyncio.to_thread(model.wait_until_entered)
-        waiting = [asyncio.create_task(batcher.step(step, **how)) for step in steps]
+        waiting = [asyncio.create_task(batcher.step(step)) for step in steps]
         await asyncio.sleep(0)  # each runs up to its wait
         model.batches.clear()
     await first

@@ -76,7 +76,7 @@ class StreamTableMachine(RuleBasedStateMachine):
 
     def forget(self, stream_id: str) -> None:
         for table in (self.sizes, self.used_s, self.owner, self.streams):
-            table.pop(stream_id)  # type: ignore[attr-defined]
+            table.pop(stream_id)
 
     @rule(target=connections, stream_id=st.sampled_from("abcde"), size=st.sampled_from([1, STATE]))
     def open(self, stream_id: str, size: int) -> Connection:

@@ -1,0 +1,156 @@
+"""Starting and ending: ready when warm, drained when told, one server a port."""
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import grpc
+import httpx
+import pytest
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+
+from tests.service.test_bad_input import reason_of
+from tests.support.frames import frame_message, make_frame, open_message
+from tests.support.models import RecallModel
+from tests.support.server import RawCall, connected, raw_stream, running_server
+from vergence_proto.v1 import depth_pb2 as pb
+from vergence_service.app import drain
+from vergence_service.transports import PortTaken
+
+SERVING = health_pb2.HealthCheckResponse.SERVING
+NOT_SERVING = health_pb2.HealthCheckResponse.NOT_SERVING
+
+
+async def test_a_drain_tells_answers_what_is_in_flight_and_ends_the_call() -> None:
+    model = RecallModel()
+    async with running_server(model) as server, raw_stream(server, "mine") as call:
+        with model.busy():
+            for i in (1, 2):
+                await call.send(frame_message(make_frame(i)))
+            await asyncio.to_thread(model.wait_until_entered)
+            draining = asyncio.create_task(drain(server, within_s=0.2))
+            notice = await call.receive()
+            assert notice is not None
+            assert notice.notice.kind == pb.NOTICE_KIND_DRAINING
+            assert notice.notice.in_s == pytest.approx(0.2)
+        assert [(await call.receive()).disparity.frame_id for _ in range(2)] == [1, 2]  # type: ignore[union-attr]
+        with pytest.raises(grpc.aio.AioRpcError) as failure:
+            await call.receive()
+        await draining
+    assert failure.value.code() is grpc.StatusCode.UNAVAILABLE
+    assert reason_of(failure.value) == "DRAINING"
+
+
+async def test_a_client_that_leaves_at_the_notice_ends_the_drain_at_once() -> None:
+    async with running_server(RecallModel()) as server, raw_stream(server, "mine") as call:
+        draining = asyncio.create_task(drain(server, within_s=3600))
+        assert (await call.receive()) is not None
+        await call.send(pb.StreamDepthRequest(end=pb.End()))
+        assert await call.receive() is None
+        await asyncio.wait_for(draining, 10)
+
+
+async def test_a_draining_server_takes_no_new_stream() -> None:
+    async with running_server(RecallModel()) as server, connected(server) as stub:
+        server.engine.drain(within_s=1)
+        with pytest.raises(grpc.aio.AioRpcError) as failure:
+            await RawCall(stub.StreamDepth()).ask(open_message())
+        assert reason_of(failure.value) == "DRAINING"
+
+
+async def test_health_is_watched_from_serving_to_draining() -> None:
+    async with (
+        running_server(RecallModel()) as server,
+        grpc.aio.insecure_channel(server.grpc_address) as channel,
+    ):
+        stub = health_pb2_grpc.HealthStub(channel)
+        request = health_pb2.HealthCheckRequest(service="vergence.v1.DepthService")
+        watch = stub.Watch(request)
+        seen = [(await asyncio.wait_for(watch.read(), 10)).status]
+        draining = asyncio.create_task(drain(server, within_s=1))
+        seen.append((await asyncio.wait_for(watch.read(), 10)).status)
+        watch.cancel()
+        await draining
+    assert seen == [SERVING, NOT_SERVING]
+
+
+async def test_http_tells_life_readiness_and_counts() -> None:
+    async with running_server(RecallModel()) as server, raw_stream(server) as call:
+        await call.ask(frame_message(make_frame(1)))
+        late = frame_message(make_frame(1))
+        await call.ask(late)
+        async with httpx.AsyncClient(base_url=f"http://{server.http_address}") as http:
+            assert (await http.get("/healthz")).json() == {"status": "alive"}
+            assert (await http.get("/readyz")).status_code == 200
+            metrics = (await http.get("/metrics")).text.splitlines()
+            server.engine.drain(within_s=1)
+            assert (await http.get("/readyz")).status_code == 503
+            assert (await http.get("/healthz")).status_code == 200
+    assert 'vergence_frames_stepped_total{origin="cold_start"} 1.0' in metrics
+    assert 'vergence_frames_failed_total{reason="FRAME_OUT_OF_ORDER"} 1.0' in metrics
+    assert "vergence_streams_open 1.0" in metrics
+    assert 'vergence_stage_seconds_count{stage="model"} 1.0' in metrics
+
+
+@pytest.mark.parametrize("transport", ["grpc", "http"])
+async def test_a_second_server_on_a_port_fails_and_says_so(transport: str) -> None:
+    async with running_server(RecallModel()) as server:
+        port = int(getattr(server, f"{transport}_address").rsplit(":", 1)[1])
+        taken: dict[str, Any] = {f"{transport}__port": port}
+        with pytest.raises(PortTaken, match=f"{port}.*{transport}.port"):
+            await running_server(RecallModel(), **taken).__aenter__()
+
+
+@contextmanager
+def served(*arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """A server process with the packaged weights."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "vergence_service", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=lambda number: number.name)
+def test_the_process_tells_its_addresses_and_ends_cleanly_on_a_signal(
+    number: signal.Signals,
+) -> None:
+    with served("--grpc-port", "0", "--http-port", "0", "--threads", "1") as process:
+        assert process.stdout is not None
+        word, *addresses = process.stdout.readline().split()
+        assert word == "listening"
+        ports = dict(address.split("=127.0.0.1:") for address in addresses)
+        assert set(ports) == {"grpc", "http"}
+        ready = httpx.get(f"http://127.0.0.1:{ports['http']}/readyz")
+        assert ready.json() == {"status": "ready"}
+        os.kill(process.pid, number)
+        assert process.wait(timeout=20) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--config", "nowhere.toml"], "cannot read nowhere.toml"),
+        (["--model", "huge"], "has no model 'huge'; it has lite"),
+        (["--weights", "/nowhere"], "no manifest at /nowhere"),
+        (["--grpc-port", "70000"], "grpc.port"),
+    ],
+    ids=["no-file", "no-model", "no-weights", "bad-port"],
+)
+def test_what_an_operator_can_mend_is_told_in_one_line(arguments: list[str], says: str) -> None:
+    with served("--http-port", "0", *arguments) as process:
+        _, errors = process.communicate(timeout=30)
+        assert process.returncode == 2
+        assert says in errors
+        assert "Traceback" not in errors
