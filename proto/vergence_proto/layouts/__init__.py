@@ -4,8 +4,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from vergence_proto.layouts import kitti, vergence_layout
-from vergence_proto.layouts.files import LayoutError
+from vergence_proto.layouts import (
+    eth3d,
+    euroc,
+    kitti,
+    kitti_pairs,
+    middlebury,
+    sceneflow,
+    tartanair,
+    vergence_layout,
+)
+from vergence_proto.layouts.files import LayoutError, numbers
 from vergence_proto.layouts.images import (
     read_disparity_png,
     read_image,
@@ -35,13 +44,21 @@ _NAMED_AT_MOST = 12
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    open_path: Callable[[Path], StereoSource]
+    open_path: Callable[..., StereoSource]  # (Path, and each option as a keyword)
     find: Callable[[Path], list[Path]]  # what open_path takes, in or under a folder
+    options: tuple[str, ...] = ()  # numbers that may follow the path: ?name=1.5
 
 
 LAYOUTS = {
     "vergence": Layout(vergence_layout.open_path, vergence_layout.find),
     "kitti": Layout(kitti.open_path, kitti.find),
+    "kitti2012": Layout(kitti_pairs.open_2012, kitti_pairs.find_2012),
+    "kitti2015": Layout(kitti_pairs.open_2015, kitti_pairs.find_2015),
+    "sceneflow": Layout(sceneflow.open_path, sceneflow.find, options=("fx",)),
+    "tartanair": Layout(tartanair.open_path, tartanair.find),
+    "euroc": Layout(euroc.open_path, euroc.find),
+    "middlebury": Layout(middlebury.open_path, middlebury.find),
+    "eth3d": Layout(eth3d.open_path, eth3d.find),
 }
 
 
@@ -51,12 +68,11 @@ def open_source(spec: str) -> StereoSource:
     Raises LayoutError: an unknown kind, a path that is not one source (those under it are named),
     or a file that is missing or wrong.
     """
-    kind, path = _parsed(spec)
-    layout = LAYOUTS[kind]
+    kind, path, options = _parsed(spec)
     try:
-        return layout.open_path(path)
+        return LAYOUTS[kind].open_path(path, **options)
     except LayoutError as error:
-        found = [each for each in layout.find(path) if each != path]
+        found = [each for each in LAYOUTS[kind].find(path) if each != path]
         if not found:
             raise
         named = ", ".join(f"{kind}:{each}" for each in found[:_NAMED_AT_MOST])
@@ -69,15 +85,25 @@ def find_sources(spec: str) -> list[str]:
 
     Raises LayoutError: an unknown kind, or no such folder.
     """
-    kind, path = _parsed(spec)
-    return [f"{kind}:{each}" for each in LAYOUTS[kind].find(path)]
+    kind, path, _ = _parsed(spec)
+    _, question, options = spec.partition("?")
+    return [f"{kind}:{each}{question}{options}" for each in LAYOUTS[kind].find(path)]
 
 
-def _parsed(spec: str) -> tuple[str, Path]:
-    kind, colon, path = spec.partition(":")
+def _parsed(spec: str) -> tuple[str, Path, dict[str, float]]:
+    kind, colon, rest = spec.partition(":")
     if not colon or kind not in LAYOUTS:
         kinds = ", ".join(f"{known}:PATH" for known in LAYOUTS)
         raise LayoutError(f"{spec!r}: expected one of {kinds}")
-    if not (Path(path).is_dir() or Path(path).parent.is_dir()):
+    location, _, query = rest.partition("?")
+    path = Path(location)
+    if not (path.is_dir() or path.parent.is_dir()):
         raise LayoutError(f"{path}: no such folder")
-    return kind, Path(path)
+    options = {}
+    for option in filter(None, query.split("&")):
+        name, _, value = option.partition("=")
+        if name not in LAYOUTS[kind].options:
+            known = ", ".join(LAYOUTS[kind].options) or "none"
+            raise LayoutError(f"{spec!r}: unknown option {name!r}; {kind}: takes {known}")
+        options[name] = numbers(value, 1, f"{spec!r}, {name}")[0]
+    return kind, path, options

@@ -30,7 +30,12 @@ def read_image(path: Path) -> Image:
 
 
 def write_disparity_png(path: Path, disparity_px: Plane) -> None:
-    """Write [H, W] pixels as 16-bit PNG, KITTI's convention: x256, 0 = none (NaN, 0, negative).
+    """Write what :func:`encode_disparity_png` makes."""
+    path.write_bytes(encode_disparity_png(disparity_px))
+
+
+def encode_disparity_png(disparity_px: Plane) -> bytes:
+    """Encode [H, W] pixels as 16-bit PNG, KITTI's convention: x256, 0 = none (NaN, 0, negative).
 
     Below 1/256 px a value is kept as 1/256, above 255.99 it saturates.
     """
@@ -38,8 +43,8 @@ def write_disparity_png(path: Path, disparity_px: Plane) -> None:
     stored = np.clip(np.rint(scaled), scaled > 0, 65535).astype(np.uint16)
     done, file = cv2.imencode(".png", stored)
     if not done:
-        raise LayoutError(f"{path}: {stored.shape} does not fit a PNG")
-    path.write_bytes(file.tobytes())
+        raise LayoutError(f"{stored.shape} does not fit a PNG")
+    return file.tobytes()
 
 
 def read_disparity_png(path: Path) -> Plane:
@@ -72,10 +77,15 @@ def read_stored_png(path: Path) -> NDArray[Any]:
 
 
 def write_pfm(path: Path, values: Plane) -> None:
-    """Write float32 [H, W] as little-endian PFM; NaN becomes +inf, the format's "unknown"."""
+    """Write what :func:`encode_pfm` makes."""
+    path.write_bytes(encode_pfm(values))
+
+
+def encode_pfm(values: Plane) -> bytes:
+    """Encode float32 [H, W] as little-endian PFM; NaN becomes +inf, the format's "unknown"."""
     height, width = values.shape
     rows = np.where(np.isnan(values), np.float32(np.inf), values)[::-1].astype("<f4")
-    path.write_bytes(f"Pf\n{width} {height}\n-1.0\n".encode() + rows.tobytes())
+    return f"Pf\n{width} {height}\n-1.0\n".encode() + rows.tobytes()
 
 
 def read_pfm(path: Path) -> Plane:
