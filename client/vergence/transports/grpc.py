@@ -6,11 +6,11 @@ from typing import cast
 
 import grpc
 from google.protobuf.message import Message
-from google.rpc import error_details_pb2
 from grpc_status import rpc_status
 
 from vergence.transports.base import Answer, Call, ConnectionLost
-from vergence_proto.errors import ERROR_DOMAIN, DepthError, FrameTooLarge, NotReady, error_from_wire
+from vergence_proto import codec
+from vergence_proto.errors import DepthError, FrameTooLarge, NotReady
 from vergence_proto.keys import STREAM_ID_METADATA
 from vergence_proto.v1 import depth_pb2 as pb
 
@@ -100,16 +100,9 @@ class _GrpcCall:
 def _error_from_rpc(error: grpc.aio.AioRpcError, address: str) -> DepthError:
     """The class the server raised, by its ErrorInfo; without one the trouble is on the way."""
     status = rpc_status.from_call(cast(grpc.Call, error))  # it has all that is read of one
-    if status is not None:
-        retry_after_s, info = None, None
-        for detail in status.details:
-            if detail.Is(error_details_pb2.RetryInfo.DESCRIPTOR):
-                retry = error_details_pb2.RetryInfo.FromString(detail.value)
-                retry_after_s = retry.retry_delay.ToTimedelta().total_seconds()
-            elif detail.Is(error_details_pb2.ErrorInfo.DESCRIPTOR):
-                info = error_details_pb2.ErrorInfo.FromString(detail.value)
-        if info is not None and info.domain == ERROR_DOMAIN:
-            return error_from_wire(info.reason, status.message, retry_after_s)
+    ours = codec.error_from_status(status) if status is not None else None
+    if ours is not None:
+        return ours
     code, details = error.code(), error.details()
     if code is grpc.StatusCode.RESOURCE_EXHAUSTED:  # gRPC's own limit on a message
         return FrameTooLarge(f"{address} refused the message: {details}")

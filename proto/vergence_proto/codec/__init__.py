@@ -35,6 +35,7 @@ from vergence_proto.codec.rigs import (
     rig_from_proto,
     rig_to_proto,
 )
+from vergence_proto.codec.status import error_from_status, error_to_status
 
 __all__ = [
     "axes_from_proto",
@@ -44,7 +45,9 @@ __all__ = [
     "disparity_from_proto",
     "disparity_to_proto",
     "error_from_frame_error",
+    "error_from_status",
     "error_to_frame_error",
+    "error_to_status",
     "frame_from_proto",
     "frame_to_proto",
     "image_from_proto",

@@ -6,13 +6,10 @@ from contextlib import asynccontextmanager
 from typing import Any
 
 import grpc
-from google.protobuf.any_pb2 import Any as AnyProto
-from google.protobuf.duration_pb2 import Duration
-from google.protobuf.message import Message
-from google.rpc import error_details_pb2, status_pb2
 from grpc_status import rpc_status
 
-from vergence_proto.errors import ERROR_DOMAIN, DepthError, ErrorCode, ModelFailed
+from vergence_proto import codec
+from vergence_proto.errors import DepthError, ErrorCode, ModelFailed
 
 log = logging.getLogger(__name__)
 
@@ -49,19 +46,8 @@ GRPC_STATUS: Mapping[ErrorCode, grpc.StatusCode] = {
 
 async def abort(context: Context, error: DepthError) -> None:
     """End the call with the error. Does not return."""
-    details: list[Message] = [
-        error_details_pb2.ErrorInfo(reason=error.code, domain=ERROR_DOMAIN),
-    ]
-    if error.retry_after_s is not None:
-        delay = Duration()
-        delay.FromNanoseconds(int(error.retry_after_s * 1e9))
-        details.append(error_details_pb2.RetryInfo(retry_delay=delay))
     code = GRPC_STATUS[error.code]
-    status = status_pb2.Status(code=code.value[0], message=str(error))
-    for detail in details:
-        packed = AnyProto()
-        packed.Pack(detail)
-        status.details.append(packed)
+    status = codec.error_to_status(error, code.value[0])
     trailing_metadata = rpc_status.to_status(status).trailing_metadata
     await context.abort(code, str(error), trailing_metadata)
 
