@@ -31,14 +31,14 @@ class TrainingConfig:
     """How a network is trained; every field can be reached by the same name on the command line."""
 
     seed: int = 1
-    batch: int = 4
-    frames: int = 3  # of a clip
+    batch: int = 2
+    frames: int = 4  # of a clip
     learning_rate: float = 1e-3
     warmup_steps: int = 200
-    decay_steps: int = 12_000  # cosine from the peak to a tenth of it, then constant
+    decay_steps: int = 5_000  # cosine from the peak to a tenth of it, then constant
     weight_decay: float = 1e-5
     gradient_norm: float = 1.0
-    ema_decay: float = 0.998
+    ema_decay: float = 0.997
     identity_share: float = 0.05  # clips that hide the motion: the network must cope without poses
     noise_share: float = 0.3  # clips whose poses are off by up to the two limits below
     noise_deg: float = 0.3

@@ -26,7 +26,7 @@ class CensusDescriptor(nn.Module):
     """Soft census bits of every 2x2 block of pixels: clip(difference / contrast, -1, 1).
 
     One convolution with a clip. It starts as the census transform, whose sign is softened so that
-    noise on a blank wall is no pattern, and learns from there.
+    noise on a blank wall is no pattern, and learns from there; its filters stay blind to brightness.
     """
 
     def __init__(self, bits: int, *, contrast: float) -> None:
@@ -35,16 +35,17 @@ class CensusDescriptor(nn.Module):
         for bit in range(bits):
             dx, dy = CENSUS_OFFSETS[bit // 4 % len(CENSUS_OFFSETS)]
             x, y = 2 + bit % 2, 2 + bit // 2 % 2
-            weight[bit, 0, y, x] = -1 / contrast
-            weight[bit, 0, y + dy, x + dx] = 1 / contrast
+            weight[bit, 0, y, x] = -1
+            weight[bit, 0, y + dy, x + dx] = 1
         self.weight = nn.Parameter(weight)
+        self.contrast = contrast
 
     def forward(self, gray: Tensor, column_stride: int) -> Tensor:
         """``gray`` [B, 1, H, W] to [B, bits, H/2, W/column_stride]; column c starts at pixel
         c * column_stride."""
+        weight = (self.weight - self.weight.mean(dim=(2, 3), keepdim=True)) * (1 / self.contrast)
         padded = F.pad(gray, (2, 3, 2, 3), mode="replicate")
-        bits = F.conv2d(padded, self.weight, stride=(2, column_stride))
-        return bits.clamp(-1, 1)
+        return F.conv2d(padded, weight, stride=(2, column_stride)).clamp(-1, 1)
 
 
 def all_pairs(left: Tensor, right: Tensor) -> Tensor:
@@ -70,7 +71,12 @@ def banded(pairs: Tensor, disparities: int) -> Tensor:
 
 
 def lookup(volume: Tensor, position: Tensor) -> Tensor:
-    """Linear interpolation along the last axis: [B, H, W, N] at [B, H, W, K]; 0 outside."""
+    """Linear interpolation along the last axis: [B, H, W, N] at [B, H, W, K]; 0 outside.
+
+    No gradient flows to the position: a disparity learns from its own loss, not from wishing to
+    have been looked up elsewhere, which would blow up over iterations and frames.
+    """
+    position = position.detach()
     last = volume.shape[-1] - 1
     low = torch.floor(position)
     inside = ((low >= 0) & (low < last)).to(volume.dtype)
@@ -85,6 +91,7 @@ def lookup_row(volume: Tensor, position: Tensor, reach: int) -> Tensor:
 
     Neighbouring positions share their entries, so it costs half the gathers.
     """
+    position = position.detach()
     last = volume.shape[-1] - 1
     low = torch.floor(position)
     index = low + torch.arange(-reach, reach + 2, device=volume.device).to(volume.dtype)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -38,15 +39,14 @@ def uvd_transforms(clips: StereoClips, world_from_left: Tensor) -> Tensor:
 
 
 def perturbed(
-    world_from_left: Tensor, *, max_deg: float, max_m: float, random: torch.Generator
+    world_from_left: Tensor, *, max_deg: float, max_m: float, random: np.random.Generator
 ) -> Tensor:
     """Poses with independent errors per frame, of a size drawn per clip up to the limits."""
     batch, frames = world_from_left.shape[:2]
-    size = torch.rand(batch, 1, 1, generator=random, dtype=torch.float64)
+    size = torch.from_numpy(random.random((batch, 1, 1)))
 
     def vectors() -> Tensor:
-        drawn = torch.randn(batch, frames, 3, generator=random, dtype=torch.float64)
-        return size * drawn / 3**0.5
+        return size * torch.from_numpy(random.standard_normal((batch, frames, 3))) / 3**0.5
 
     rotation = vectors() * torch.deg2rad(torch.tensor(max_deg, dtype=torch.float64))
     noise = torch.eye(4, dtype=torch.float64).repeat(batch, frames, 1, 1)

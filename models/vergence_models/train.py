@@ -29,7 +29,7 @@ from torch import Tensor
 from vergence_models.config import CONFIGS, Config, load_config
 from vergence_models.data.clips import StereoClips
 from vergence_models.data.pool import ClipPool
-from vergence_models.data.sensor import SensorModel
+from vergence_models.data.sensor import film_as_sensor
 from vergence_models.losses import step_loss
 from vergence_models.motion import perturbed, uvd_transforms
 from vergence_models.network import State, StereoNetwork
@@ -68,7 +68,7 @@ class Trainer:
             betas=(0.9, 0.99),
             weight_decay=config.training.weight_decay,
         )
-        self.random = torch.Generator().manual_seed(config.training.seed)
+        self.random = np.random.default_rng(config.training.seed)
         self.progress = Progress()
         self.measured: dict[str, float] = {}
         self.commands: list[str] = []
@@ -89,8 +89,7 @@ class Trainer:
                 "weights": self.network.state_dict(),
                 "average": self.average,
                 "optimizer": self.optimizer.state_dict(),
-                "random": self.random.get_state(),
-                "torch_random": torch.get_rng_state(),
+                "random": self.random.bit_generator.state,
                 "progress": dataclasses.asdict(self.progress),
                 "story": story,
                 "measured": self.measured,
@@ -104,18 +103,13 @@ class Trainer:
         self.network.load_state_dict(contents["weights"])
         self.average = {k: v.to(self.device) for k, v in contents["average"].items()}
         self.optimizer.load_state_dict(contents["optimizer"])
-        self.random.set_state(contents["random"])
-        torch.set_rng_state(contents["torch_random"])
+        self.random.bit_generator.state = contents["random"]
         self.progress = Progress(**contents["progress"])
         self.measured = contents["measured"]
         self.commands = contents["story"]["commands"]
 
     def chance(self, share: float) -> bool:
-        return bool(torch.rand((), generator=self.random) < share)
-
-    def pick(self, low: int, high: int) -> int:
-        """An integer from ``low`` to ``high``, both included."""
-        return int(torch.randint(low, high + 1, (), generator=self.random))
+        return bool(self.random.random() < share)
 
     def transforms(self, clips: StereoClips) -> Tensor:
         """The motion the network is told, float32 [B, T, 4, 4]: true, noisy, or none at all."""
@@ -144,7 +138,7 @@ class Trainer:
             reset = frame == 0 or self.chance(training.reset_share)
             if reset:
                 state = cold
-            iterations = self.pick(1, 4) if reset else 1 + int(self.chance(0.2))
+            iterations = int(self.random.integers(1, 5)) if reset else 1 + int(self.chance(0.2))
             left, right = (
                 eye[:, frame].permute(0, 2, 3, 1).contiguous() for eye in (clips.left, clips.right)
             )
@@ -187,9 +181,8 @@ def train(trainer: Trainer, arguments: argparse.Namespace) -> None:
 
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, on_signal)
-    pool = ClipPool(arguments.pool)
-    sensor = SensorModel()
-    held_out = ClipPool(arguments.val) if arguments.val else None
+    pool = ClipPool(*arguments.pool)
+    held_out = ClipPool(*arguments.val) if arguments.val else None
     out: Path = arguments.out
     training = trainer.config.training
     started = saved = validated = last = time.monotonic()
@@ -199,9 +192,10 @@ def train(trainer: Trainer, arguments: argparse.Namespace) -> None:
         return (time.monotonic() - started) / 60
 
     while not stop and elapsed_minutes() < arguments.minutes:
-        clips = pool.sample(training.batch, generator=trainer.random)
-        clips = sensor(clips, trainer.random)
-        recent.append(trainer.step(clips))
+        clips = pool.sample(
+            trainer.random, training.batch, frames=training.frames, reverse=0.5, skip=0.3, flip=0.3
+        )
+        recent.append(trainer.step(film_as_sensor(clips, trainer.random)))
         now = time.monotonic()
         trainer.progress.minutes += (now - last) / 60
         last = now
@@ -211,6 +205,7 @@ def train(trainer: Trainer, arguments: argparse.Namespace) -> None:
         if now - saved > 60 * arguments.save_minutes:
             saved = now
             trainer.save(out)
+            pool.refresh()  # a pool may still be growing
         if held_out is not None and now - validated > 60 * arguments.val_minutes:
             network = trainer.averaged_network()
             trainer.measured = validate(network, held_out, trainer.device)

@@ -11,11 +11,17 @@ from torch import Tensor
 
 from vergence_models.data.clips import StereoClips
 from vergence_models.data.pool import ClipPool
+from vergence_models.data.sensor import film_as_sensor
 from vergence_models.losses import known
 from vergence_models.motion import uvd_transforms
 from vergence_models.network import Estimate, State, StereoNetwork
 
 COLD_ITERATIONS = 4
+
+
+def filmed(pool: ClipPool, indices: range) -> StereoClips:
+    """Clips as a camera sees them, the same every time."""
+    return film_as_sensor(pool.clips(indices), np.random.default_rng(indices.start))
 
 
 @torch.inference_mode()
@@ -49,7 +55,7 @@ def validate(
     sums: dict[str, list[float]] = {}
     limit = network.config.max_disparity_px
     for start in range(0, min(clips, len(pool)), 8):
-        part = pool.clips(slice(start, start + 8))
+        part = filmed(pool, range(start, min(start + 8, clips, len(pool))))
         for frame, estimate in enumerate(predict(network, part, device)):
             truth = part.disparity_px[:, frame].to(device)
             mask = known(truth, limit) > 0
@@ -73,7 +79,7 @@ def save_picture(
     network: StereoNetwork, pool: ClipPool, path: Path, device: torch.device, *, clips: int = 6
 ) -> None:
     """A PNG with a row per clip: left image, truth, estimate, error, sigma of its last frame."""
-    part = pool.clips(slice(0, clips))
+    part = filmed(pool, range(min(clips, len(pool))))
     last = predict(network, part, device)[-1]
     rows = []
     for index in range(len(part)):

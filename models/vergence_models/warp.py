@@ -109,11 +109,12 @@ def warp_state(
     previous = disparity[:, 0]
     _, height, width = previous.shape
     u, v = cell_centres(height, width, scale, previous)
-    u_to, v_to, d_to = transform_uvd(uvd_curr_from_prev, u, v, previous)
+    u_to, v_to, d_to = transform_uvd(uvd_curr_from_prev, u, v, previous.detach())
     d_to = d_to * (previous > MIN_DISPARITY_PX).to(d_to.dtype)
     column = torch.floor((u_to + 0.5) / scale).clamp(-1, width)
     row = torch.floor((v_to + 0.5) / scale).clamp(-1, height)
-    landed = fill_cracks(splat_nearest(d_to, column, row))
+    # Geometry passes no gradient, values do: see layers.lookup.
+    landed = fill_cracks(splat_nearest(d_to, column, row)).detach()
     seen = (landed > MIN_DISPARITY_PX).to(landed.dtype)
 
     # The inverse in double: a float32 product of pixel-sized entries would lose the sub-pixel part.
