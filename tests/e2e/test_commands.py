@@ -1,0 +1,191 @@
+"""The commands as a person types them, each in a process of its own, with the weights that ship."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.e2e.wall import HEIGHT, WIDTH, write_pair, write_wall
+
+PATIENCE_S = 60.0
+REPOSITORY = Path(__file__).parents[2]
+
+
+def vergence(*arguments: object, without: str = "") -> subprocess.CompletedProcess[str]:
+    """Run the command; ``without`` is a package that shall not be importable."""
+    hidden = f"sys.modules[{without!r}] = None; " if without else ""
+    code = (
+        f"import sys; {hidden}from vergence.cli.app import main; sys.argv[0] = 'vergence'; main()"
+    )
+    return subprocess.run(
+        [sys.executable, "-c", code, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        env={**os.environ, "COLUMNS": "200", "NO_COLOR": "1"},
+        check=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def wall(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_wall(tmp_path_factory.mktemp("data") / "wall", frames=5)
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[str]:
+    command = [sys.executable, "-m", "vergence_service", "--grpc-port", "0", "--http-port", "0"]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as process:
+        assert process.stdout is not None
+        ready = process.stdout.readline()
+        assert ready.startswith("listening grpc="), "the server did not start"
+        yield ready.split()[1].removeprefix("grpc=")
+        process.terminate()
+        assert process.wait(timeout=PATIENCE_S) == 0
+
+
+def test_demo_ends_with_a_picture_a_video_and_a_table(wall: Path, tmp_path: Path) -> None:
+    done = vergence(
+        *("demo", "--source", f"vergence:{wall}", "--frames", 3),
+        *("--out", tmp_path / "pictures", "--json", tmp_path / "figures.json"),
+    )
+    assert done.returncode == 0, done.stderr
+    assert "EPE" in done.stdout
+    figures = json.loads((tmp_path / "figures.json").read_text())
+    expected = {"frames", "fps", "latency_p50_ms", "latency_p95_ms", "epe_px", "d1_pct", "d3_pct"}
+    assert expected <= figures.keys()
+    assert figures["frames"] == 3
+    assert figures["fps"] > 0
+    assert figures["epe_px"] >= 0
+    picture = cv2.imread(str(tmp_path / "pictures" / "demo.png"))
+    assert picture is not None
+    assert picture.std() > 10
+    video = cv2.VideoCapture(str(tmp_path / "pictures" / "demo.mp4"))
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 3
+
+
+def test_demo_needs_nothing_but_what_was_installed(tmp_path: Path) -> None:
+    done = vergence("demo", "--frames", 2, "--out", tmp_path, "--json", tmp_path / "figures.json")
+    assert done.returncode == 0, done.stderr
+    figures = json.loads((tmp_path / "figures.json").read_text())
+    assert figures["frames"] == 2
+    assert figures["epe_px"] is not None  # the bundled sample has its truth
+
+
+def test_run_writes_every_frame_losslessly(wall: Path, server: str, tmp_path: Path) -> None:
+    done = vergence(
+        *("run", f"vergence:{wall}", "--server", server, "--out", tmp_path / "out"),
+        *("--json", tmp_path / "figures.json", "--pictures"),
+    )
+    assert done.returncode == 0, done.stderr
+    names = [f"{index:04d}.png" for index in range(5)]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [*names, "sheet.png"]
+    figures = json.loads((tmp_path / "figures.json").read_text())
+    assert (figures["frames"], figures["frames_dropped"]) == (5, 0)
+    stored = [cv2.imread(str(tmp_path / "out" / name), cv2.IMREAD_UNCHANGED) for name in names]
+    assert {(image.dtype, image.shape) for image in stored} == {(np.dtype("u2"), (HEIGHT, WIDTH))}
+    # The table's figure is that of the files, up to their steps of 1/256 px.
+    errors_px = [np.abs(image / 256.0 - 6).mean() for image in stored]
+    assert figures["epe_px"] == pytest.approx(np.mean(errors_px), abs=0.01)
+
+
+def test_run_takes_a_lone_pair_and_starts_a_server_for_it(tmp_path: Path) -> None:
+    pair = write_pair(tmp_path / "pair")
+    done = vergence("run", f"vergence:{pair}", "--out", tmp_path / "out", "--json", tmp_path / "j")
+    assert done.returncode == 0, done.stderr
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["disp.png"]
+    assert json.loads((tmp_path / "j").read_text())["epe_px"] is None  # the pair has no truth
+
+
+def test_run_at_a_rate_accounts_for_every_frame(wall: Path, server: str, tmp_path: Path) -> None:
+    done = vergence(
+        *("run", f"vergence:{wall}", "--server", server, "--out", tmp_path / "out"),
+        *("--rate", 2000, "--json", tmp_path / "figures.json"),
+    )
+    assert done.returncode == 0, done.stderr
+    figures = json.loads((tmp_path / "figures.json").read_text())
+    assert figures["frames"] + figures["frames_dropped"] == 5
+    assert figures["frames_dropped"] > 0  # five frames in 2.5 ms are more than the credit
+    assert len(list((tmp_path / "out").iterdir())) == figures["frames"]
+    assert "at the source" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "told"),
+    [
+        (["run", "nonsense"], 2, "expected one of vergence:PATH"),
+        (["run", "vergence:/nowhere/at/all"], 2, "no such folder"),
+        (["run", "WALL", "--rate", "soon"], 2, "expected a rate in Hz, source or max"),
+        (["run", "WALL", "--server", "http://x"], 2, "expected a server as grpc://HOST:PORT"),
+        (["run", "WALL", "--server", "127.0.0.1:1"], 1, "no connection to 127.0.0.1:1"),
+        (["demo", "--source", "kitti:here"], 2, "expected KITTI's camera projections"),
+    ],
+    ids=["kind", "folder", "rate", "scheme", "nobody-there", "demo"],
+)
+def test_what_a_person_got_wrong_is_told_without_a_trace(
+    wall: Path, tmp_path: Path, arguments: list[str], code: int, told: str
+) -> None:
+    done = vergence(
+        *(f"vergence:{wall}" if argument == "WALL" else argument for argument in arguments),
+        *("--out", tmp_path / "out"),
+    )
+    assert done.returncode == code
+    assert told in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_damaged_frame_in_the_middle_is_named(server: str, tmp_path: Path) -> None:
+    film = write_wall(tmp_path / "film", frames=3)
+    damaged = film / "frame_0001_right.png"
+    damaged.write_bytes(damaged.read_bytes()[:200])
+    done = vergence("run", f"vergence:{film}", "--server", server, "--out", tmp_path / "out")
+    assert done.returncode == 2
+    assert str(damaged) in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("missing", "arguments", "extra"),
+    [
+        ("typer", ["--version"], "vergence[cli]"),
+        ("rich", ["doctor"], "vergence[cli]"),
+        ("fastapi", ["serve"], "vergence[server]"),
+    ],
+)
+def test_what_is_not_installed_is_told_with_the_extra_that_brings_it(
+    missing: str, arguments: list[str], extra: str
+) -> None:
+    done = vergence(*arguments, without=missing)
+    assert done.returncode == 1
+    assert missing in done.stderr
+    assert extra in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_server_that_does_not_start_is_quoted(wall: Path, tmp_path: Path) -> None:
+    done = vergence(
+        *("run", f"vergence:{wall}", "--out", tmp_path / "out"), without="vergence_service"
+    )
+    assert done.returncode == 1
+    assert "vergence[server]" in done.stderr
+
+
+def test_doctor_finds_the_weights_and_a_running_server(server: str) -> None:
+    done = vergence("doctor", "--server", server)
+    assert done.returncode == 0, done.stdout
+    assert "lite" in done.stdout
+    assert f"{server} runs" in done.stdout
+
+
+def test_help_of_a_contributed_command_is_its_own() -> None:
+    done = vergence("serve", "--help")
+    assert done.returncode == 0
+    assert "--print-config" in done.stdout
