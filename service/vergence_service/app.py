@@ -16,9 +16,11 @@ from vergence_service.metrics import Metrics
 from vergence_service.model import OnnxStereoModel, StereoModel, packaged_weights_dir
 from vergence_service.settings import Settings
 from vergence_service.streams import StreamTable
+from vergence_service.transports.calls import OpenCalls
 from vergence_service.transports.grpc_server import DepthServicer, GrpcServer
 from vergence_service.transports.grpc_stream import StreamLimits
 from vergence_service.transports.http_app import HttpServer, make_http_app
+from vergence_service.transports.unary import UnaryMethods
 
 _MIB = 1 << 20
 _SWEEP_EVERY_S = 1.0
@@ -77,16 +79,13 @@ async def running(
         metrics=metrics,
     )
     max_frame_bytes = settings.grpc.max_frame_mib * _MIB
-    servicer = DepthServicer(
-        engine,
-        provider=model.provider,
-        limits=StreamLimits(
-            credit=settings.grpc.credit,
-            waiting_frames=settings.grpc.waiting_frames,
-            max_frame_bytes=max_frame_bytes,
-        ),
-        clock=clock,
+    limits = StreamLimits(
+        credit=settings.grpc.credit,
+        waiting_frames=settings.grpc.waiting_frames,
+        max_frame_bytes=max_frame_bytes,
     )
+    unary = UnaryMethods(engine, provider=model.provider, max_frame_bytes=max_frame_bytes)
+    servicer = DepthServicer(unary, OpenCalls(engine, limits=limits, clock=clock))
     # Outermost ends last: no transport outlives the batcher that it feeds.
     async with (
         batcher,

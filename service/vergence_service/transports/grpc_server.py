@@ -1,22 +1,18 @@
 """vergence.v1.DepthService over grpc.aio, with the standard health and reflection services."""
 
-import asyncio
-from collections.abc import AsyncIterator, Callable
-from importlib.metadata import version
+from collections.abc import AsyncIterator
 from typing import Self
 
 import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
-from vergence_proto import codec
-from vergence_proto.errors import Draining
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.v1 import depth_pb2_grpc
-from vergence_service.engine import DepthEngine
 from vergence_service.transports import PortTaken
+from vergence_service.transports.calls import OpenCalls
 from vergence_service.transports.grpc_errors import Context, errors_as_status
-from vergence_service.transports.grpc_stream import DepthCall, StreamLimits, model_info
+from vergence_service.transports.unary import UnaryMethods
 
 _SERVICE = pb.DESCRIPTOR.services_by_name["DepthService"].full_name
 
@@ -36,82 +32,39 @@ _KEEPALIVE = (
 class DepthServicer(depth_pb2_grpc.DepthServiceServicer):
     """Translates each call to the engine's words."""
 
-    def __init__(
-        self,
-        engine: DepthEngine,
-        *,
-        provider: str,
-        limits: StreamLimits,
-        clock: Callable[[], float],
-    ) -> None:
-        self._engine = engine
-        self._provider = provider
-        self._limits = limits
-        self._clock = clock
-        self.calls: set[DepthCall] = set()
-        self.idle = asyncio.Event()  # no call is open
-        self.idle.set()
+    def __init__(self, unary: UnaryMethods, calls: OpenCalls) -> None:
+        self._unary = unary
+        self.calls = calls
 
     async def StreamDepth(  # noqa: N802 -- the wire's name
         self, request_iterator: AsyncIterator[pb.StreamDepthRequest], context: Context
     ) -> None:
-        call = DepthCall(
-            self._engine, request_iterator, context.write, limits=self._limits, clock=self._clock
-        )
-        self.calls.add(call)
-        self.idle.clear()
-        try:
-            async with errors_as_status(context):
-                await call.run()
-        finally:
-            self.calls.discard(call)
-            if not self.calls:
-                self.idle.set()
+        async with errors_as_status(context):
+            await self.calls.run(self.calls.make(request_iterator, context.write))
 
     async def GetServerInfo(  # noqa: N802
         self, request: pb.GetServerInfoRequest, context: Context
     ) -> pb.GetServerInfoResponse:
-        return pb.GetServerInfoResponse(
-            version=version("vergence"),
-            model=model_info(self._engine.card),
-            provider=self._provider,
-            streams_open=len(self._engine.streams),
-            streams_max=self._engine.streams.capacity,
-            max_message_bytes=self._limits.max_frame_bytes,
-            max_pixels=self._engine.max_pixels,
-        )
+        async with errors_as_status(context):
+            return await self._unary.server_info(request)
 
     async def GetStream(  # noqa: N802
         self, request: pb.GetStreamRequest, context: Context
     ) -> pb.GetStreamResponse:
         async with errors_as_status(context):
-            stream = self._engine.streams.get(request.stream_id)
-            return pb.GetStreamResponse(
-                stream_id=stream.stream_id,
-                attached=stream.attachment is not None,
-                rig=codec.rectified_rig_to_proto(stream.rectifier.rig),
-                frames_stepped=stream.frames_stepped,
-                frames_dropped=stream.frames_dropped,
-                frames_failed=stream.frames_failed,
-                last_frame_id=stream.last_frame_id,
-                step_count=stream.state.step_count if stream.state else 0,
-                idle_s=self._engine.streams.idle_s(stream),
-                state_bytes=stream.state.nbytes if stream.state else 0,
-            )
+            return await self._unary.stream(request)
 
     async def ResetStream(  # noqa: N802
         self, request: pb.ResetStreamRequest, context: Context
     ) -> pb.ResetStreamResponse:
         async with errors_as_status(context):
-            await self._engine.reset(request.stream_id)
-        return pb.ResetStreamResponse()
+            return await self._unary.reset(request)
 
     async def CloseStream(  # noqa: N802
         self, request: pb.CloseStreamRequest, context: Context
     ) -> pb.CloseStreamResponse:
         async with errors_as_status(context):
-            self._engine.close(request.stream_id)
-        return pb.CloseStreamResponse()
+            return await self._unary.close(request)
 
 
 class GrpcServer:
@@ -164,12 +117,7 @@ class GrpcServer:
     async def drain(self, *, within_s: float) -> None:
         """Let calls end by themselves, then answer what they have sent and end them."""
         await self._tell_health(health_pb2.HealthCheckResponse.NOT_SERVING)
-        try:
-            async with asyncio.timeout(within_s):
-                await self._servicer.idle.wait()
-        except TimeoutError:
-            for call in self._servicer.calls:
-                call.finish(Draining("the server is shutting down; continue on another one"))
+        await self._servicer.calls.drain(within_s=within_s)
         await self._server.stop(grace=within_s)
 
     async def _tell_health(self, status: health_pb2.HealthCheckResponse.ServingStatus) -> None:

@@ -7,12 +7,12 @@ from functools import partial
 
 from vergence_proto import codec
 from vergence_proto.errors import BadShape, DepthError, FrameTooLarge, StreamExists, UnknownStream
-from vergence_proto.model_io import ModelCard
 from vergence_proto.types import DisparityMap
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.engine import DepthEngine
 from vergence_service.streams import Notice, NoticeKind, Opening, Stream
 from vergence_service.transports.mailbox import Letter, Mailbox
+from vergence_service.transports.unary import model_info
 
 # One map is encoded and sent while the next is stepped. Past it the stepper waits for the client
 # to read, and newer frames displace older ones in the mailbox.
@@ -229,12 +229,3 @@ class DepthCall:
         self._engine.metrics.stage_s.labels("encode").observe(done_s - started_s)
         self._engine.metrics.stage_s.labels("total").observe(done_s - answer.arrived_s)
         return pb.StreamDepthResponse(disparity=message)
-
-
-def model_info(card: ModelCard) -> pb.ModelInfo:
-    return pb.ModelInfo(
-        name=card.name,
-        weights_sha256=card.weights_sha256,
-        iterations=sorted(card.graphs),
-        max_disparity_px=card.max_disparity_px,
-    )
