@@ -63,7 +63,7 @@ class Pose:
         xw, yw, zw = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
         products = np.array([[0, xy, xz, xw], [xy, 0, yz, yw], [xz, yz, 0, zw], [xw, yw, zw, 0]])
         largest = int(np.argmax(squares))
-        quaternion = products[largest]
+        quaternion: Matrix = products[largest]
         quaternion[largest] = squares[largest]
         quaternion /= np.linalg.norm(quaternion)
         return -quaternion if quaternion[3] < 0 else quaternion

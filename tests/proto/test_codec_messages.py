@@ -2,6 +2,7 @@ import math
 
 import numpy as np
 import pytest
+from google.rpc import error_details_pb2
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -413,6 +414,25 @@ def test_the_error_of_a_frame_keeps_its_class(code: ErrorCode, retry_after_s: fl
     assert (str(back), back.retry_after_s) == ("the reason", retry_after_s)
 
 
+@pytest.mark.parametrize("code", ErrorCode)
+@pytest.mark.parametrize("retry_after_s", [None, 0.5])
+def test_an_error_keeps_its_class_as_a_status(code: ErrorCode, retry_after_s: float | None) -> None:
+    status = codec.error_to_status(ERROR_CLASSES[code]("why", retry_after_s=retry_after_s), 3)
+    back = codec.error_from_status(type(status).FromString(status.SerializeToString()))
+    assert status.code == 3
+    assert type(back) is ERROR_CLASSES[code]
+    assert (str(back), back.retry_after_s) == ("why", retry_after_s)
+
+
+def test_a_status_of_another_program_is_not_ours() -> None:
+    status = codec.error_to_status(BadPose("why"), 3)
+    info = error_details_pb2.ErrorInfo(reason="BAD_POSE", domain="example.com")
+    status.details[0].Pack(info)
+    assert codec.error_from_status(status) is None
+    del status.details[:]
+    assert codec.error_from_status(status) is None
+
+
 def test_the_list_of_public_names_is_sorted_and_complete() -> None:
-    public = {name for name in vars(codec) if name.endswith("_proto") or "frame_error" in name}
+    public = {name for name in vars(codec) if "_to_" in name or "_from_" in name}
     assert codec.__all__ == sorted(public)

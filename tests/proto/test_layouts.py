@@ -1,6 +1,5 @@
 """Every reader gives what its layout says, checked by formulas of the test's own."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -44,27 +43,16 @@ def assert_images(source: StereoSource, index: int, left: int, right: int) -> No
     np.testing.assert_array_equal(frame.right, trees.an_image(right))
 
 
-TREES: dict[str, Callable[[Path], Path]] = {
-    "vergence": trees.vergence_sequence,
-    "kitti": trees.kitti_sequence,
-    "kitti2012": lambda root: trees.kitti_pair(root, 2012),
-    "kitti2015": lambda root: trees.kitti_pair(root, 2015),
-    "sceneflow": trees.sceneflow_sequence,
-    "tartanair": lambda root: trees.tartanair_trajectory(root, 1),
-    "euroc": trees.euroc_recording,
-    "middlebury": trees.middlebury_scene,
-    "eth3d": trees.eth3d_scene,
-}
 OPTIONS = {"sceneflow": "?fx=20"}
 
 
 def test_every_layout_has_a_tree_here() -> None:
-    assert set(TREES) == set(LAYOUTS)
+    assert set(trees.TREES) == set(LAYOUTS)
 
 
-@pytest.mark.parametrize("kind", TREES)
+@pytest.mark.parametrize("kind", trees.TREES)
 def test_what_is_found_under_a_folder_opens(kind: str, tmp_path: Path) -> None:
-    TREES[kind](tmp_path)
+    trees.TREES[kind](tmp_path)
     (spec,) = find_sources(f"{kind}:{tmp_path}{OPTIONS.get(kind, '')}")
     source = open_source(spec)
     frames = list(source)
@@ -231,7 +219,8 @@ class TestTartanAir:
 class TestEuroc:
     def test_the_rig_is_the_raw_one(self, tmp_path: Path) -> None:
         source = open_source(f"euroc:{trees.euroc_recording(tmp_path)}")
-        assert (source.name, source.fps) == ("MH_01_easy", pytest.approx(20))
+        assert source.name == "MH_01_easy"
+        assert source.fps == pytest.approx(20)
         left = source.rig.left
         assert (left.fx, left.fy, left.cx, left.cy) == (20.5, 20.6, 11.7, 7.4)
         assert left.distortion is Distortion.BROWN_CONRADY

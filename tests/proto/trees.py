@@ -1,6 +1,7 @@
 """Tiny data sets, written in the layouts that the readers must read."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -243,3 +244,16 @@ def eth3d_scene(root: Path) -> Path:
     mask = np.where(a_disparity() > 5, 128, 255).astype(np.uint8)
     write_image(truth / "mask0nocc.png", mask)
     return scene
+
+
+TREES: dict[str, Callable[[Path], Path]] = {
+    "vergence": vergence_sequence,
+    "kitti": kitti_sequence,
+    "kitti2012": lambda root: kitti_pair(root, 2012),
+    "kitti2015": lambda root: kitti_pair(root, 2015),
+    "sceneflow": sceneflow_sequence,
+    "tartanair": lambda root: tartanair_trajectory(root, 1),
+    "euroc": euroc_recording,
+    "middlebury": middlebury_scene,
+    "eth3d": eth3d_scene,
+}

@@ -16,6 +16,8 @@ from vergence_proto.layouts import (
 )
 from vergence_proto.layouts.files import LayoutError, numbers
 from vergence_proto.layouts.images import (
+    encode_disparity_png,
+    encode_pfm,
     read_disparity_png,
     read_image,
     read_pfm,
@@ -30,6 +32,8 @@ __all__ = [
     "SourceFrame",
     "StereoSource",
     "Truth",
+    "encode_disparity_png",
+    "encode_pfm",
     "find_sources",
     "open_source",
     "read_disparity_png",

@@ -4,7 +4,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,13 +45,18 @@ def numbers(words: str, count: int | None, origin: str) -> list[float]:
 
 def npz_arrays(path: Path, *names: str) -> Mapping[str, NDArray[Any]]:
     """Read a whole .npz. Raises LayoutError: damaged, or without one of ``names``."""
-    existing(path, "an .npz")
-    try:
-        with np.load(path) as file:
-            arrays = dict(file)
-    except (ValueError, EOFError, OSError, zipfile.BadZipFile, zlib.error) as error:
-        raise LayoutError(f"{path}: no readable .npz: {error}") from None
+    # Opened here, because np.load leaves a damaged file open.
+    with existing(path, "an .npz").open("rb") as file:
+        arrays = _loaded(path, file)
     for name in names:
         if name not in arrays:
             raise LayoutError(f"{path}: expected an array {name!r}, got {', '.join(arrays)}")
     return arrays
+
+
+def _loaded(path: Path, file: BinaryIO) -> Mapping[str, NDArray[Any]]:
+    try:
+        with np.load(file) as archive:
+            return dict(archive)
+    except (ValueError, EOFError, OSError, zipfile.BadZipFile, zlib.error) as error:
+        raise LayoutError(f"{path}: no readable .npz: {error}") from None

@@ -15,7 +15,7 @@ from vergence_proto.types import Image, Plane
 
 # KITTI's development kit: stored = disparity * 256, and 0 means none.
 _PNG_STEPS_PER_PX = np.float32(256)
-_PFM_HEADER = re.compile(rb"(P[fF])\s+(\d+)\s+(\d+)\s+([-+.\deE]+)\s")
+_PFM_HEADER = re.compile(rb"(P[fF])\s+(\d+)\s+(\d+)\s+(-?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)\s")
 
 
 def read_image(path: Path) -> Image:

@@ -63,7 +63,7 @@ def open_path(path: Path) -> StereoSource:
 def read_projections(path: Path, label: str, cameras: tuple[int, int]) -> tuple[Matrix, Matrix]:
     """Read two 3x4 projections, in the lines that ``label`` with the camera's number starts.
 
-    Raises LayoutError: missing file or line, or not 12 numbers.
+    Raises LayoutError: missing file or line, not 12 numbers, or no projection.
     """
     lines = dict(
         line.split(maxsplit=1)
@@ -75,7 +75,10 @@ def read_projections(path: Path, label: str, cameras: tuple[int, int]) -> tuple[
         name = label.format(camera)
         if name not in lines:
             raise LayoutError(f"{path}: expected a line {name} with 12 numbers, found none")
-        found.append(np.reshape(numbers(lines[name], 12, f"{path}, {name}"), (3, 4)))
+        projection = np.reshape(numbers(lines[name], 12, f"{path}, {name}"), (3, 4))
+        if not (projection[0, 0] > 0 and np.linalg.det(projection[:, :3]) > 0):
+            raise LayoutError(f"{path}, {name}: expected K [I | t], got {projection.tolist()}")
+        found.append(projection)
     return found[0], found[1]
 
 
@@ -84,11 +87,9 @@ def rig_from_projections(
 ) -> StereoRig:
     """The rectified rig of two KITTI projections; ``size`` is (width, height).
 
-    Raises LayoutError: the projections are of no stereo rig.
+    Raises LayoutError: the right camera is not to the right of the left one.
     """
     left, right = projections
-    if not (left[0, 0] > 0 and right[0, 0] > 0):
-        raise LayoutError(f"{origin}: expected positive focal lengths in the projections")
     return rectified_rig(
         origin,
         size,
@@ -103,10 +104,7 @@ def rig_from_projections(
 
 def _offset_m(projection: Matrix) -> Matrix:
     """Where cam0's origin is in the camera of P = K [I | t]: t = K^-1 P[:, 3]."""
-    try:
-        return np.linalg.solve(projection[:, :3], projection[:, 3]).astype(np.float64)
-    except np.linalg.LinAlgError:
-        raise LayoutError(f"a KITTI projection is singular: {projection.tolist()}") from None
+    return np.linalg.solve(projection[:, :3], projection[:, 3]).astype(np.float64)
 
 
 def _times_ns(path: Path, count: int) -> list[int]:

@@ -116,10 +116,13 @@ def _pair(path: Path) -> FrameFiles:
 
 
 def _frames(path: Path, rig: StereoRig, fps: float | None) -> list[FrameFiles]:
-    # Counted by what is there, so that a gap in the numbers is an error and not an early end.
-    count = len({each.stem for each in path.glob("frame_*_left.*")})
-    if count == 0:
+    stems = {each.stem for each in path.glob("frame_*_left.*")}
+    if not stems:
         raise LayoutError(f"{path}: expected frame_0000_left and on, or left and right; found none")
+    count = len(stems)
+    missing = next((k for k in range(count) if f"frame_{k:04d}_left" not in stems), None)
+    if missing is not None:  # a gap is an error and not an early end
+        raise LayoutError(f"{path}/frame_{missing:04d}_left: not found, but later frames are there")
     trajectory = path / "poses.txt"
     poses = read_matrix_poses(trajectory) if trajectory.exists() else [None] * count
     if len(poses) != count:
