@@ -1,6 +1,6 @@
 """The law of the whole path: a stream over the network is the model stepped by hand."""
 
-from pathlib import Path
+import asyncio
 
 import numpy as np
 import pytest
@@ -10,6 +10,7 @@ from tests.support.server import running_server
 from vergence import (
     Delivery,
     DepthClient,
+    DepthResult,
     ImageEncoding,
     OutputFormat,
     PlaneEncoding,
@@ -55,48 +56,57 @@ def stepped_by_hand(model: OnnxStereoModel, source: StereoSource) -> list[Plane]
     return offsets_px
 
 
+async def streamed(
+    client: DepthClient,
+    source: StereoSource,
+    *,
+    output: OutputFormat | None = None,
+    encoding: ImageEncoding = ImageEncoding.RAW,
+) -> list[DepthResult]:
+    async with client.open_session(
+        source.rig,
+        delivery=Delivery.EVERY,
+        output=output,
+        encoding=encoding,
+        iterations=WARM,
+        cold_iterations=COLD,
+    ) as session:
+        return [
+            await session.step(each.frame.left, each.frame.right, each.frame.pose)
+            for each in source
+        ]
+
+
 @pytest.mark.parametrize("encoding", [ImageEncoding.RAW, ImageEncoding.PNG])
 async def test_streamed_equals_offline_bit_for_bit(
     model: OnnxStereoModel, source: StereoSource, encoding: ImageEncoding
 ) -> None:
     output = OutputFormat(encoding=PlaneEncoding.FLOAT32)
-    async with (
-        running_server(model) as server,
-        DepthClient(server.grpc_address) as client,
-        client.open_session(
-            source.rig,
-            delivery=Delivery.EVERY,
-            output=output,
-            encoding=encoding,
-            iterations=WARM,
-            cold_iterations=COLD,
-        ) as session,
-    ):
-        streamed = [
-            await session.step(each.frame.left, each.frame.right, each.frame.pose)
-            for each in source
-        ]
-    for result, offset_px in zip(streamed, stepped_by_hand(model, source), strict=True):
+    async with running_server(model) as server, DepthClient(server.grpc_address) as client:
+        results = await streamed(client, source, output=output, encoding=encoding)
+    for result, offset_px in zip(results, stepped_by_hand(model, source), strict=True):
         # The wire says NaN where a disparity is not positive.
         np.testing.assert_array_equal(result.offset_px[result.valid], offset_px[result.valid])
         assert (offset_px[~result.valid] <= 0).all()
 
 
-async def test_the_default_output_is_exact_to_a_128th_of_a_pixel(
-    model: OnnxStereoModel, source: StereoSource, tmp_path: Path
+async def test_two_clients_at_once_get_what_each_gets_alone(
+    model: OnnxStereoModel, source: StereoSource
 ) -> None:
-    async with (
-        running_server(model) as server,
-        DepthClient(server.grpc_address) as client,
-        client.open_session(
-            source.rig, iterations=WARM, cold_iterations=COLD, delivery=Delivery.EVERY
-        ) as session,
-    ):
-        streamed = [
-            await session.step(each.frame.left, each.frame.right, each.frame.pose)
-            for each in source
-        ]
-    for result, offset_px in zip(streamed, stepped_by_hand(model, source), strict=True):
+    async with running_server(model) as server, DepthClient(server.grpc_address) as client:
+        alone = await streamed(client, source)
+        together = await asyncio.gather(*(streamed(client, source) for _ in range(2)))
+    for results in together:
+        for result, same in zip(results, alone, strict=True):
+            np.testing.assert_array_equal(result.disparity_px, same.disparity_px)
+
+
+async def test_the_default_output_is_exact_to_a_128th_of_a_pixel(
+    model: OnnxStereoModel, source: StereoSource
+) -> None:
+    async with running_server(model) as server, DepthClient(server.grpc_address) as client:
+        results = await streamed(client, source)
+    for result, offset_px in zip(results, stepped_by_hand(model, source), strict=True):
         assert result.valid.mean() > 0.5
         error = np.abs(result.offset_px - offset_px)[result.valid & (offset_px > 1 / 64)]
         assert error.max() <= 0.5 / 64
