@@ -107,9 +107,10 @@ class TestTemporalError:
         if abs(change_px - 1) > 1e-4:
             assert found.t1_pct == (100 if change_px > 1 else 0)
 
-    def test_it_is_what_following_every_point_by_hand_gives(self) -> None:
+    @pytest.mark.parametrize("motion", [MOTION, MOTION.inverse()], ids=["there", "back"])
+    def test_it_is_what_following_every_point_by_hand_gives(self, motion: Pose) -> None:
         rng = np.random.default_rng(0)
-        first, second = wall_seen_from(Pose.identity()), wall_seen_from(MOTION)
+        first, second = wall_seen_from(Pose.identity()), wall_seen_from(motion)
         second[10:20, 10:30] += 4  # something came between
         first[:5] = np.nan
         noisy = [
@@ -119,10 +120,10 @@ class TestTemporalError:
         expected = []
         for v in range(RIG.height):
             for u in range(RIG.width):
-                errors = _follow(u, v, first, second, noisy)
+                errors = _follow(u, v, motion, first, second, noisy)
                 expected += errors
         found = temporal_epe(
-            *noisy, prev_truth_px=first, curr_truth_px=second, rig=RIG, curr_from_prev=MOTION
+            *noisy, prev_truth_px=first, curr_truth_px=second, rig=RIG, curr_from_prev=motion
         )
         assert 0 < found.n == len(expected) < first.size
         assert found.tepe_px == pytest.approx(np.mean(expected), rel=1e-5)
@@ -139,7 +140,9 @@ class TestTemporalError:
         assert math.isnan(found.tepe_px)
 
 
-def _follow(u: int, v: int, first: Plane, second: Plane, noisy: list[Plane]) -> list[float]:
+def _follow(
+    u: int, v: int, motion: Pose, first: Plane, second: Plane, noisy: list[Plane]
+) -> list[float]:
     """One pixel's error, or none if its point is not seen again."""
     offset_px = float(first[v, u])
     disparity_px = offset_px - (RIG.cx_left - RIG.cx_right)
@@ -147,7 +150,7 @@ def _follow(u: int, v: int, first: Plane, second: Plane, noisy: list[Plane]) -> 
         return []
     z = RIG.fx * RIG.baseline_m / disparity_px
     point: Matrix = np.array([(u - RIG.cx_left) / RIG.fx * z, (v - RIG.cy) / RIG.fy * z, z])
-    x, y, z = MOTION.rotation @ point + MOTION.translation_m
+    x, y, z = motion.rotation @ point + motion.translation_m
     u_curr, v_curr = RIG.fx * x / z + RIG.cx_left, RIG.fy * y / z + RIG.cy
     if not (0 <= u_curr < RIG.width - 1 and 0 <= v_curr < RIG.height - 1):
         return []

@@ -94,7 +94,7 @@ class TestDamage:
     ) -> None:
         message = image_to_proto(smooth_image(), encoding)
         message.data = message.data[: data.draw(st.integers(0, len(message.data) - 1))]
-        with pytest.raises(BadImage):
+        with pytest.raises(BadImage, match=r"cut short|expected a"):
             image_from_proto(message)
 
     @pytest.mark.parametrize("encoding", FILES)
@@ -184,6 +184,16 @@ def test_progressive_jpeg_is_read_too() -> None:
     options = [cv2.IMWRITE_JPEG_PROGRESSIVE, 1, cv2.IMWRITE_JPEG_RST_INTERVAL, 2]
     file = cv2.imencode(".jpg", smooth_image(), options)[1].tobytes()
     message = pb.Image(encoding=pb.IMAGE_ENCODING_JPEG, width=64, height=48, data=file)
+    assert image_from_proto(message).shape == (48, 64, 3)
+
+
+def test_tables_may_stand_before_the_frame_header() -> None:
+    """Huffman tables have a marker that looks like a frame header's."""
+    file = cv2.imencode(".jpg", smooth_image())[1].tobytes()
+    start = file.index(b"\xff\xc4")
+    length = 2 + int.from_bytes(file[start + 2 : start + 4], "big")
+    tables_first = file[:2] + file[start : start + length] + file[2:]
+    message = pb.Image(encoding=pb.IMAGE_ENCODING_JPEG, width=64, height=48, data=tables_first)
     assert image_from_proto(message).shape == (48, 64, 3)
 
 

@@ -1,4 +1,5 @@
 import sys
+import tracemalloc
 from contextlib import suppress
 
 import numpy as np
@@ -135,7 +136,21 @@ class TestDamage:
     def test_a_bomb_is_not_unpacked(self) -> None:
         message = plane_to_proto(_slope(), OutputFormat())
         message.data = zstd.compress(bytes(64 << 20))
+        tracemalloc.start()
         with pytest.raises(BadImage, match="hold more"):
+            plane_from_proto(message)
+        _, peak_bytes = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert peak_bytes < 1 << 20
+
+    def test_a_frame_that_lacks_its_end_is_an_error_though_all_pixels_are_there(self) -> None:
+        message = plane_to_proto(_slope(), OutputFormat())
+        checked = {zstd.CompressionParameter.checksum_flag.value: 1}
+        whole = zstd.compress(zstd.decompress(message.data), options=checked)
+        message.data = whole
+        assert plane_from_proto(message).shape == _slope().shape
+        message.data = whole[:-1]
+        with pytest.raises(BadImage, match="one whole zstd frame"):
             plane_from_proto(message)
 
     @pytest.mark.parametrize(
