@@ -1,7 +1,9 @@
 """The way in: one client per server, any number of sessions on it."""
 
+import re
 import uuid
 from collections.abc import Callable
+from functools import partial
 from typing import Self
 
 from vergence.info import ServerInfo, StreamInfo
@@ -10,11 +12,14 @@ from vergence.session import DepthSession
 from vergence.transports.base import Transport
 from vergence.transports.grpc import GrpcTransport
 from vergence_proto import codec
+from vergence_proto.errors import BadShape
 from vergence_proto.geometry import Axes, RectifiedRig
 from vergence_proto.types import Delivery, ImageEncoding, OutputFormat, StereoRig
 from vergence_proto.v1 import depth_pb2 as pb
 
 DEFAULT_SERVER = "grpc://127.0.0.1:50051"
+
+_STREAM_ID = re.compile(r"[A-Za-z0-9._-]{1,128}")
 
 
 class DepthClient:
@@ -27,10 +32,10 @@ class DepthClient:
     """
 
     def __init__(self, server: str = DEFAULT_SERVER) -> None:
-        self._address = _grpc_address(server)
+        self._connect = _connector(server)
 
     async def __aenter__(self) -> Self:
-        self._transport: Transport = GrpcTransport(self._address)
+        self._transport = self._connect()
         return self
 
     async def __aexit__(self, *exc_info: object) -> None:
@@ -74,10 +79,10 @@ class DepthClient:
         on_event
             Called in the event loop with what happens to the session; must not block.
 
-        Entering raises BadCalibration, StreamExists, StreamLimit, StateMemory, Draining, NotReady.
+        Raises BadShape: the stream id. Entering raises BadCalibration, StreamExists, StreamLimit, StateMemory, Draining, NotReady.
         """
         opening = pb.OpenStream(
-            stream_id=stream_id or uuid.uuid4().hex,
+            stream_id=_checked_id(uuid.uuid4().hex if stream_id is None else stream_id),
             resume_token=resume_token,
             rig=codec.rig_to_proto(
                 StereoRig.from_rectified(rig) if isinstance(rig, RectifiedRig) else rig
@@ -113,10 +118,19 @@ class DepthClient:
         await self._transport.ask("CloseStream", request, pb.CloseStreamResponse)
 
 
-def _grpc_address(server: str) -> str:
+def _connector(server: str) -> Callable[[], Transport]:
+    """What makes the transport to ``server``, to be called in the event loop it will live in."""
     scheme, separator, address = server.rpartition("://")
-    host, colon, port = address.rpartition(":")
-    known = scheme == ("grpc" if separator else "")
-    if not (known and host and colon and port.isdecimal()):
-        raise ValueError(f"expected a server as grpc://HOST:PORT, got {server!r}")
-    return address
+    host, _, port = address.rpartition(":")
+    if scheme == ("grpc" if separator else "") and host and port.isdecimal():
+        return partial(GrpcTransport, address)
+    raise ValueError(f"expected a server as grpc://HOST:PORT, got {server!r}")
+
+
+def _checked_id(stream_id: str) -> str:
+    # Before it is sent: it travels in a header, which cannot carry every character.
+    if not _STREAM_ID.fullmatch(stream_id):
+        raise BadShape(
+            f"expected a stream id of 1 to 128 characters of A-Z a-z 0-9 . _ -, got {stream_id!r}"
+        )
+    return stream_id

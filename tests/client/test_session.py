@@ -283,6 +283,15 @@ async def test_what_no_server_would_take_is_refused_before_it_is_sent(client: De
         with pytest.raises(BadPose):
             session.submit(frame.left, frame.right, Pose(np.eye(3), np.full(3, np.nan)))
         assert submit(session, 2) == 1
+    for stream_id in ("", "a/b", "bäd", "x" * 129):
+        with pytest.raises(BadShape, match="1 to 128"):
+            client.open_session(RIG, stream_id=stream_id)
+
+
+@pytest.mark.parametrize("server", ["http://host:80", "host", ":50051", "grpc://", "host:port"])
+def test_a_server_that_is_none_is_refused_by_its_spelling(server: str) -> None:
+    with pytest.raises(ValueError, match=r"grpc://HOST:PORT"):
+        DepthClient(server)
 
 
 async def test_waiting_in_vain_for_a_place_says_how_long_to_wait() -> None:
