@@ -143,8 +143,10 @@ def plant(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> N
         out /= np.linalg.norm(out)
         at = out * rng.uniform(0.15, 0.6) * s - (0, 2 * r, 0)
         # Leaves lie along the way out, with a random roll about it.
-        turned = look_along(out) @ _roll(rng.uniform(0, 3.1)) @ np.array(
-            [[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]
+        turned = (
+            look_along(out)
+            @ _roll(rng.uniform(0, 3.1))
+            @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
         )
         b.add(Shape.QUAD, at, (length * 0.45, length, 1.0), leaf, rotation=turned,
               cutout=Cutout.LEAF)  # fmt: skip
@@ -208,7 +210,8 @@ def tree(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> No
 
 
 def car(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> None:
-    paint = palette.polished(mirror=rng.uniform(0.1, 0.4)) if rng.random() < 0.6 else palette.plain()
+    shiny = rng.random() < 0.6
+    paint = palette.polished(mirror=rng.uniform(0.1, 0.4)) if shiny else palette.plain()
     glass, tyre = palette.polished(mirror=0.6), palette.plain(tone=0.1)
     b.box((0, -0.65 * s, 0), (0.85 * s, 0.35 * s, 2.1 * s), paint)
     b.box((0, -1.2 * s, 0.2 * s), (0.75 * s, 0.25 * s, 1.1 * s), glass)
@@ -216,7 +219,8 @@ def car(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> Non
     for x in (-0.8, 0.8):
         for z in (-1.3, 1.3):
             end = np.array([x * s, -0.33 * s, z * s])
-            b.rod(end - (0.1 * s, 0, 0), end + (0.1 * s, 0, 0), 0.33 * s, tyre)
+            half = np.array([0.1 * s, 0, 0])
+            b.rod(end - half, end + half, 0.33 * s, tyre)
 
 
 def _roll(angle: float) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:

@@ -54,7 +54,10 @@ class Palette:
         gain = float(rng.choice([0.0, 0.01, 0.03]))
         r, g, b = (float(c - gain / 2) for c in color)
         return Material(
-            self.texture("clouds", "speckle"), rng.uniform(0.5, 2), (gain,) * 3, (r, g, b),
+            self.texture("clouds", "speckle"),
+            rng.uniform(0.5, 2),
+            (gain,) * 3,
+            (r, g, b),
             specular=self._gloss(0.3),
         )
 

@@ -20,7 +20,7 @@ def pattern(rng: np.random.Generator, size: int, kind: str | None = None) -> NDA
 
 
 def noise(rng: np.random.Generator, size: int, *, exponent: float, stretch: float = 1.0) -> Field:
-    """Periodic noise whose amplitude falls as frequency ** -exponent; stretch > 1: fibres along x."""
+    """Periodic noise, amplitude ~ frequency ** -exponent; stretch > 1 draws fibres along x."""
     fy = np.fft.fftfreq(size)[:, None]
     fx = np.fft.rfftfreq(size)[None, :] * stretch
     amplitude = (fx * fx + fy * fy + size**-2.0) ** (-exponent / 2)
@@ -28,7 +28,7 @@ def noise(rng: np.random.Generator, size: int, *, exponent: float, stretch: floa
     spectrum = amplitude * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape))
     spectrum[0, 0] = 0
     field = np.fft.irfft2(spectrum, s=(size, size))
-    return np.clip(field / (5 * field.std()) + 0.5, 0, 1).astype(np.float32)
+    return np.asarray(np.clip(field / (5 * field.std()) + 0.5, 0, 1), np.float32)
 
 
 def _palette(rng: np.random.Generator) -> Colors:

@@ -9,7 +9,7 @@ grows, and a stopped run goes on where it was.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -46,8 +46,7 @@ class _Shard:
 class ClipPool:
     """Clips of one size and length, memory-mapped from the shards of one or more folders.
 
-    Raises:
-        FileNotFoundError: no folder holds a shard (of the size asked for).
+    FileNotFoundError means that no folder holds a shard (of the size asked for).
     """
 
     def __init__(self, *folders: Path, size: tuple[int, int] | None = None) -> None:
@@ -196,7 +195,6 @@ def write_shard(folder: Path, clips: StereoClips) -> None:
 
 
 def _render_shard(folder: Path, config: GeneratorConfig, seed: int, indices: range) -> int:
-    torch.set_num_threads(1)
     generator = _generator(config)
     # One clip at a time: on a CPU larger batches only spill the caches.
     write_shard(
@@ -225,17 +223,27 @@ def render_pool(
         if not folder.exists():
             missing.append((folder, range(first, min(first + shard_clips, clips))))
     columns = (SpinnerColumn(), *Progress.get_default_columns()[:2], MofNCompleteColumn())
-    rendered = 0
-    with (
-        Progress(*columns, TimeRemainingColumn()) as progress,
-        ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as executor,
-    ):
+    with Progress(*columns, TimeRemainingColumn()) as progress:
         bar = progress.add_task("clips", total=sum(len(indices) for _, indices in missing))
+        for count in _render_shards(missing, config, seed, workers):
+            progress.advance(bar, count)
+    return sum(len(indices) for _, indices in missing)
+
+
+def _render_shards(
+    missing: list[tuple[Path, range]], config: GeneratorConfig, seed: int, workers: int
+) -> Iterator[int]:
+    """Yields the number of clips of each shard as it is done."""
+    if workers == 1:
+        for folder, indices in missing:
+            yield _render_shard(folder, config, seed, indices)
+        return
+    with ProcessPoolExecutor(
+        workers, mp_context=get_context("spawn"), initializer=torch.set_num_threads, initargs=(1,)
+    ) as executor:
         jobs = [executor.submit(_render_shard, f, config, seed, indices) for f, indices in missing]
         for job in as_completed(jobs):
-            rendered += job.result()
-            progress.advance(bar, job.result())
-    return rendered
+            yield job.result()
 
 
 def main(
@@ -250,6 +258,8 @@ def main(
 ) -> None:
     """Render a pool of clean clips, or go on with one that was stopped."""
     width, height = (int(side) for side in size.split("x"))
+    if workers == 1:
+        torch.set_num_threads(1)  # the arrays are too small to be shared among threads
     config = GeneratorConfig(width=width, height=height, frames=frames, textures=textures)
     count = render_pool(
         out, config, clips=clips, seed=seed, shard_clips=shard_clips, workers=workers

@@ -60,10 +60,9 @@ def cast(primitives: Primitives, cameras: Cameras) -> Hits:
     first_row, last_row, first_column, last_column = _tile_bounds(primitives, cameras)
     tile_y = torch.arange(rows, device=device)
     tile_x = torch.arange(columns, device=device)
-    overlap = (
-        ((tile_y >= first_row[:, None]) & (tile_y <= last_row[:, None]))[:, :, None]
-        & ((tile_x >= first_column[:, None]) & (tile_x <= last_column[:, None]))[:, None, :]
-    )
+    overlap = ((tile_y >= first_row[:, None]) & (tile_y <= last_row[:, None]))[:, :, None] & (
+        (tile_x >= first_column[:, None]) & (tile_x <= last_column[:, None])
+    )[:, None, :]
 
     tiles = primitives.views * rows * columns
     depth = torch.full((tiles, _LANES), float("inf"), device=device)
@@ -78,7 +77,7 @@ def cast(primitives: Primitives, cameras: Cameras) -> Hits:
         view = m // primitives.per_view
         tile = (view * rows + y) * columns + x
         for pick in _rounds(tile):
-            for part in pick.split(_CHUNK_TILES):
+            for part in torch.split(pick, _CHUNK_TILES):
                 part_m, part_view, part_tile = m[part], view[part], tile[part]
                 u = (x[part] * TILE_PX)[:, None] + lane_x
                 v = (y[part] * TILE_PX)[:, None] + lane_y
@@ -100,7 +99,8 @@ def intersect_rays(
     primitives: Primitives, shape: Shape, m: Tensor, ray_x: Tensor, ray_y: Tensor
 ) -> Tensor:
     """Depth [P, S] where rays (x, y, 1) [P, S] meet primitives m [P], all of one shape."""
-    origin, direction = to_local(primitives.local_from_view[:, m, None], ray_x, ray_y)
+    rows = primitives.local_from_view.index_select(1, m)[..., None]
+    origin, direction = to_local(rows, ray_x, ray_y)
     return intersect(
         shape,
         origin,
@@ -130,7 +130,7 @@ def _rounds(tile: Tensor) -> list[Tensor]:
     starts[1:] = ordered[1:] != ordered[:-1]
     rank = position - torch.cummax(torch.where(starts, position, 0), dim=0).values
     by_rank = rank.argsort(stable=True)
-    return list(order[by_rank].split(torch.bincount(rank).tolist()))
+    return list(torch.split(order[by_rank], torch.bincount(rank).tolist()))
 
 
 def _untile(tiled: Tensor, rows: int, columns: int, size: tuple[int, int, int]) -> Tensor:

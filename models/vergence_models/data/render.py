@@ -197,13 +197,14 @@ def _shadow_maps(rows: Tensor, shots: list[Shot]) -> tuple[Tensor, Tensor, list[
         focals.append(resolution / 2 / np.tan(shot.scene.shadow_half_angle_rad))
     world_from_light = torch.from_numpy(np.stack(poses)).to(rows.device)
     still = rows.clone()
-    moves = (rows[..., scenes.VELOCITY_M_S] != 0).any(-1) | (rows[..., scenes.SPIN_RAD_S] != 0).any(-1)
+    moves = (rows[..., scenes.VELOCITY_M_S.start : scenes.SPIN_RAD_S.stop] != 0).any(-1)
     glows = rows[..., scenes.MATERIAL.stop - 1] > 0
-    still[..., scenes.SHAPE] = torch.where(moves | glows, float(Shape.PAD), rows[..., scenes.SHAPE])
+    shape = rows[..., scenes.SHAPE]
+    still[..., scenes.SHAPE] = torch.where(moves | glows, float(Shape.PAD), shape)
     # A light has one view where the rig has two per frame; its second is dropped again.
     eyes = world_from_light[:, None, None].expand(-1, 1, 2, -1, -1)
     both, _ = _in_views(still, [_at_start(s) for s in shots], eyes)
-    keep = torch.arange(both.shape.shape[0], device=rows.device).view(len(shots), 2, -1)[:, 0].flatten()
+    keep = torch.arange(len(both.shape), device=rows.device).view(len(shots), 2, -1)[:, 0].flatten()
     single = Primitives(
         both.shape[keep], both.local_from_view[:, keep], both.view_from_local[keep],
         both.taper[keep], both.cutout[keep], len(shots),
@@ -227,7 +228,7 @@ def _color(
     views, height, width = hits.primitive.shape
     pixel = torch.arange(views * height * width, device=hits.depth_m.device)
 
-    def rays(at: Tensor, du: float, dv: float) -> tuple[Tensor, Tensor, Tensor]:
+    def rays(at: Tensor, du: Tensor | float, dv: Tensor | float) -> tuple[Tensor, Tensor, Tensor]:
         view = at // (height * width)
         u, v = at % width + du, at // width % height + dv
         x = (u - cameras.cx[view]) / cameras.fx[view]
@@ -245,12 +246,11 @@ def _color(
     places = torch.stack([edge + step for step in (0, -1, 1, -width, width)])
     own = color.clamp(max=_BRIGHTEST)
     nearby = own[places.clamp(0, len(own) - 1)]  # [5, N, 3]
-    sampled = torch.zeros(len(edge), 3, device=color.device)
-    for du, dv in _SAMPLES:
-        _, x, y = rays(edge, du, dv)
-        source = _nearest_of(primitives, candidates, x, y)
-        sampled += nearby.gather(0, source[None, :, None].expand(1, -1, 3))[0]
-    color[edge] = sampled / len(_SAMPLES)
+    offsets = torch.tensor(_SAMPLES, device=color.device)
+    _, x, y = rays(edge[:, None], offsets[:, 0], offsets[:, 1])
+    source = _nearest_of(primitives, candidates, x, y)  # [N, samples]
+    chosen = nearby.permute(1, 0, 2).gather(1, source[..., None].expand(-1, -1, 3))
+    color[edge] = chosen.mean(1)
     return color.view(views, height, width, 3)
 
 
@@ -263,10 +263,13 @@ def _neighbours(surface: Tensor) -> Tensor:
 
 
 def _nearest_of(primitives: Primitives, candidates: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """Which of K candidates [K, N] rays [N] hit first: 0 where they slip through them all."""
+    """Which of K candidates [K, N] rays [N, S] hit first: 0 where they slip through them all."""
     depth = torch.full(x.shape, float("inf"), device=x.device)
     # Candidate -1 is the sky, behind everything; the pixel's own stands in where there is none.
-    nearest = torch.where((candidates < 0).any(0), (candidates < 0).int().argmax(0), 0)
+    backdrop = torch.zeros_like(candidates[0])
+    for k in range(len(candidates) - 1, -1, -1):
+        backdrop = torch.where(candidates[k] < 0, k, backdrop)
+    nearest = backdrop[:, None].repeat(1, x.shape[1])
     for k, candidate in enumerate(candidates):
         fresh = candidate >= 0
         for earlier in candidates[:k]:
@@ -275,10 +278,11 @@ def _nearest_of(primitives: Primitives, candidates: Tensor, x: Tensor, y: Tensor
         for shape in (Shape.QUAD, Shape.BOX, Shape.ELLIPSOID, Shape.CYLINDER):
             at = (shapes == shape).nonzero()[:, 0]
             if len(at):
-                t = intersect_rays(primitives, shape, candidate[at], x[at, None], y[at, None])[:, 0]
-                wins = t < depth[at]
-                depth[at] = torch.where(wins, t, depth[at])
-                nearest[at] = torch.where(wins, k, nearest[at])
+                ray_x, ray_y = x.index_select(0, at), y.index_select(0, at)
+                t = intersect_rays(primitives, shape, candidate[at], ray_x, ray_y)
+                known = depth.index_select(0, at)
+                depth[at] = torch.minimum(t, known)
+                nearest[at] = torch.where(t < known, k, nearest.index_select(0, at))
     return nearest
 
 

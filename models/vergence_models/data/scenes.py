@@ -78,8 +78,11 @@ class Builder:
         turned = self.rotation if rotation is None else self.rotation @ rotation
         half = np.maximum(np.asarray(half_m, float), 1e-4)
         self.rows.append(
-            [shape, *center, *turned.ravel(), *half, taper, cutout, *self.velocity_m_s]
-            + [*np.asarray(spin_rad_s, float), *material.row()]
+            [
+                *(shape, *center, *turned.ravel(), *half, taper, cutout, *self.velocity_m_s),
+                *np.asarray(spin_rad_s, float),
+                *material.row(),
+            ]
         )
 
     def box(self, center_m: ArrayLike, half_m: ArrayLike, material: Material) -> None:
@@ -96,7 +99,9 @@ class Builder:
         half = (radius_m, radius_m, half_height_m)
         self.add(Shape.CYLINDER, center_m, half, material, rotation=_Z_UP, taper=taper)
 
-    def rod(self, start_m: ArrayLike, end_m: ArrayLike, radius_m: float, material: Material) -> None:
+    def rod(
+        self, start_m: ArrayLike, end_m: ArrayLike, radius_m: float, material: Material
+    ) -> None:
         """A cylinder between two points."""
         start, end = np.asarray(start_m, float), np.asarray(end_m, float)
         half = (radius_m, radius_m, float(np.linalg.norm(end - start)) / 2)

@@ -69,14 +69,15 @@ class _Recording:
         shifts = happens(config.misalignment)
         self._shift_px = rng.uniform(-1, 1) * config.misalignment_px if shifts else 0.0
         sigma = rng.uniform(0.3, 1.1) if happens(config.defocus) else 0.0
-        self._sigmas_px = sigma * rng.uniform(0.8, 1.2, 2)
+        self._sigmas_px: list[float] = (sigma * rng.uniform(0.8, 1.2, 2)).tolist()
         length, angle = rng.uniform(1.5, config.motion_blur_px), rng.uniform(0, np.pi)
         self._streak = _streak(length, angle) if happens(config.motion_blur) else None
         self._falloff = _vignette(height, width, rng.uniform(0.1, 0.6) * happens(config.vignetting))
         brightness = np.exp(rng.normal(0, 0.06, frames) * happens(config.flicker))
         tone = _tone(rng, spread=float(happens(config.tone)))
         mismatch = _tone(rng, spread=0.25 * happens(config.mismatch))
-        self._curves = [[_curve(b, *eye) for b in brightness] for eye in ((tone,), (tone, mismatch))]
+        tones = ((tone,), (tone, mismatch))
+        self._curves = [[_curve(b, *eye) for b in brightness] for eye in tones]
         level = config.noise_levels * rng.uniform(0, 1) ** 2 * happens(config.noise)
         self._read_noise, self._shot_noise = level, level * rng.uniform(0, 1)
         self._grey = happens(config.grey)
@@ -95,7 +96,7 @@ class _Recording:
                 cv2.warpAffine(image, move, image.shape[1::-1], borderMode=cv2.BORDER_REPLICATE)
             )
         if self._sigmas_px[right] > 0:
-            sigma = float(self._sigmas_px[right])
+            sigma = self._sigmas_px[right]
             image = _u8(cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE))
         if self._streak is not None:
             image = _u8(cv2.filter2D(image, -1, self._streak, borderType=cv2.BORDER_REPLICATE))
@@ -118,9 +119,7 @@ def _u8(image: cv2.typing.MatLike) -> Image:
     return np.asarray(image, np.uint8)
 
 
-def _tone(
-    rng: np.random.Generator, *, spread: float
-) -> tuple[float, float, NDArray[np.float64]]:
+def _tone(rng: np.random.Generator, *, spread: float) -> tuple[float, float, NDArray[np.float64]]:
     """Gain, gamma and a tint [3], all near one."""
     gain = float(np.exp(rng.normal(0, 0.28 * spread)))
     gamma = float(np.exp(rng.normal(0, 0.2 * spread)))

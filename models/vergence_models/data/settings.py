@@ -64,8 +64,10 @@ def room(rng: np.random.Generator, palette: Palette, view: Viewpoint) -> tuple[S
         if placed >= wanted:
             break
     floating = int(rng.choice([0, 0, 2, 5]))
-    _float(Builder(rows=b.rows), palette, rng, view, floating, far_m=float(half.min()), up_m=camera_height,
-           moving=0.3)  # fmt: skip
+    _float(
+        Builder(rows=b.rows), palette, rng, view, floating,
+        far_m=float(half.min()), up_m=camera_height, moving=0.3,
+    )  # fmt: skip
     lamp = world_from_room @ (rng.uniform(-0.5, 0.5, 3) * (2 * half[0], 0, 2 * half[1])) + offset
     lamp[1] = -height + 0.15 * s
     b_lamp = Builder(rows=b.rows)
@@ -74,14 +76,14 @@ def room(rng: np.random.Generator, palette: Palette, view: Viewpoint) -> tuple[S
         b_lamp.rod(lamp, (lamp[0], -height, lamp[2]), 0.008 * s, palette.plain())
     center = world_from_room @ np.zeros(3) + offset
     lights = (
-        Light(lamp + (0, 0.05 * s, 0), _light_color(rng, 1.6), 3 * s),
+        Light(lamp + np.array([0, 0.05 * s, 0]), _light_color(rng, 1.6), 3 * s),
         Light(center + rng.normal(0, 1.5 * s, 3) * (1, 0, 1) - (0, height * 0.6, 0),
               _light_color(rng, 0.6), 3 * s),
     )  # fmt: skip
     target = lamp + np.array([0.01, 1.0, 0.02])
-    return _scene(b, rng, palette, lights, target, np.radians(68), frame_m=float(half.max())), float(
-        camera_height
-    )
+    reach = float(half.max())
+    scene = _scene(b, rng, palette, lights, target, np.radians(68), frame_m=reach)
+    return scene, float(camera_height)
 
 
 def _stand(
@@ -100,7 +102,8 @@ def _shell(
     height: float, s: float,
 ) -> None:  # fmt: skip
     x, z = half
-    b.floor((0, 0, 0), x, z, palette.textured(1.5 * s, "wood", "tiles", "photo", "stones", "clouds"))
+    ground = palette.textured(1.5 * s, "wood", "tiles", "photo", "stones", "clouds")
+    b.floor((0, 0, 0), x, z, ground)
     ceiling = palette.plain() if rng.random() < 0.75 else palette.textured(1.5 * s)
     b.floor((0, -height, 0), x, z, ceiling)
     shared = palette.plain() if rng.random() < 0.45 else palette.textured(1.5 * s)
@@ -129,7 +132,8 @@ def _hang(
         frame = palette.wood(s) if rng.random() < 0.5 else palette.plain()
         if kind < 0.4:
             wall.box((x, y, -0.015 * s), (w + 0.04 * s, h + 0.04 * s, 0.015 * s), frame)
-            wall.wall((x, y, -0.032 * s), w, h, palette.textured(2 * max(w, h), "photo", "patchwork"))
+            picture = palette.textured(2 * max(w, h), "photo", "patchwork")
+            wall.wall((x, y, -0.032 * s), w, h, picture)
         elif kind < 0.55:
             bright = palette.lamp()
             wall.wall((x, y, -0.005 * s), w, 0.6 * s, bright)
@@ -147,7 +151,8 @@ def _hang(
         else:
             cloth = palette.textured(0.5 * s) if rng.random() < 0.5 else palette.plain()
             for fold in range(int(rng.integers(4, 9))):
-                wall.post((x + fold * 0.09 * s, -height * 0.5, -0.05 * s), 0.055 * s, height * 0.45, cloth)
+                at = (x + fold * 0.09 * s, -height * 0.5, -0.05 * s)
+                wall.post(at, 0.055 * s, height * 0.45, cloth)
 
 
 def street(rng: np.random.Generator, palette: Palette, view: Viewpoint) -> tuple[Scene, float]:
@@ -179,9 +184,9 @@ def street(rng: np.random.Generator, palette: Palette, view: Viewpoint) -> tuple
     if rng.random() < 0.7:  # hills or a skyline along the horizon
         far = rng.uniform(80, 350) * s
         for turn in np.linspace(-1.2, 1.2, 7):
-            side = b.at(0, 0, 0, yaw=float(turn)).at(0, 0, far)
+            horizon = b.at(0, 0, 0, yaw=float(turn)).at(0, 0, far)
             h = far * rng.uniform(0.02, 0.2)
-            side.wall((0, -h, 0), far * 0.25, h, palette.textured(far * 0.3, "photo", "clouds"))
+            horizon.wall((0, -h, 0), far * 0.25, h, palette.textured(far * 0.3, "photo", "clouds"))
     for _ in range(int(rng.integers(5, 18))):
         x, z = _spot(rng, view, far_m=60 * s)
         if np.hypot(x, z) < view.nearest_m + 1.5 * s:

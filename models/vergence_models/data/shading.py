@@ -47,13 +47,9 @@ def shade(
     `table` float32 [C, M] has for each primitive local_from_view 12, half_m 3, shape 1, material
     14; m int64 [N] is -1 for the sky.
     """
-    colors, surfaces = [], []
-    for part in torch.arange(len(m), device=m.device).split(_CHUNK):
-        color, surface = _shade_chunk(
-            table, light, bank, m[part], view[part], ray_x[part], ray_y[part], depth_m[part]
-        )
-        colors.append(color)
-        surfaces.append(surface)
+    samples = (m, view, ray_x, ray_y, depth_m)
+    chunks = zip(*(torch.split(values, _CHUNK) for values in samples), strict=True)
+    colors, surfaces = zip(*(_shade_chunk(table, light, bank, *c) for c in chunks), strict=True)
     return torch.cat(colors), torch.cat(surfaces)
 
 
@@ -63,7 +59,9 @@ def _shade_chunk(
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     sky = m < 0
     rows = table.index_select(1, m.clamp(min=0))
-    by_view = light.columns.index_select(1, view)
+    # Most chunks lie within one view, whose columns then broadcast.
+    one_view = int(view[0]) == int(view[-1])
+    by_view = light.columns.index_select(1, view[:1] if one_view else view)
     t = torch.where(sky, 1.0, t)
     origin, direction = to_local(rows[:12], x, y)
     half = rows[12:15]
@@ -94,7 +92,7 @@ def _shade_chunk(
         n, r = normal[:, shiny], ray[:, shiny]
         bounced = r - 2 * _dot(n, r) * n
         looking = torch.where(sky[shiny], r, bounced)
-        around = _surroundings(bank, looking, by_view[:, shiny])
+        around = _surroundings(bank, looking, by_view if one_view else by_view[:, shiny])
         share = mirror[shiny]
         color[:, shiny] = color[:, shiny] * (1 - share) + around * share
     return color.t(), surface
@@ -191,7 +189,7 @@ def _unshadowed(
     u, v = u.clamp(1, resolution - 3), v.clamp(1, resolution - 3)
     u0, v0 = u.floor(), v.floor()
     fu, fv = u - u0, v - v0
-    index = (light.scene[view] * resolution + v0.long()) * resolution + u0.long()
+    index = (light.scene.index_select(0, view) * resolution + v0.long()) * resolution + u0.long()
     near = depth * (1 - _SHADOW_BIAS)
     flat = light.shadow_depth_m.view(-1)
     weights_u, weights_v = (1 - fu, torch.ones_like(fu), fu), (1 - fv, torch.ones_like(fv), fv)
@@ -226,9 +224,9 @@ def _surroundings(bank: TextureBank, direction: Tensor, by_view: Tensor) -> Tens
     azimuth = torch.atan2(x, z)
     elevation = torch.atan2(y, (x * x + z * z).sqrt())
     texels = bank.size / math.pi
-    pixel = by_view[_PIXEL] * texels
+    pixel = (by_view[_PIXEL] * texels).expand_as(azimuth)
     texture = bank.sample(
-        by_view[_SKY].long(),
+        by_view[_SKY].long().expand(len(azimuth)),
         azimuth * texels * 2,
         (elevation + math.pi / 2) * texels,
         (pixel * 2, torch.zeros_like(pixel)),

@@ -79,17 +79,17 @@ def _inside_cutout(x: Tensor, y: Tensor, cutout: Tensor) -> Tensor:
 
 
 def _box(origin: Vector, direction: Vector) -> Tensor:
-    enter: Tensor | None = None
-    leave: Tensor | None = None
-    for o, d in zip(origin, direction, strict=True):
-        inverse = 1 / d
-        middle = -o * inverse
-        half = inverse.abs()
-        near, far = middle - half, middle + half
-        enter = near if enter is None else torch.maximum(enter, near)
-        leave = far if leave is None else torch.minimum(leave, far)
-    assert enter is not None and leave is not None
+    enter, leave = _slab(origin[0], direction[0])
+    for axis in (1, 2):
+        near, far = _slab(origin[axis], direction[axis])
+        enter, leave = torch.maximum(enter, near), torch.minimum(leave, far)
     return _accept(enter, enter <= leave)
+
+
+def _slab(origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+    inverse = 1 / direction
+    middle, half = -origin * inverse, inverse.abs()
+    return middle - half, middle + half
 
 
 def _sphere(origin: Vector, direction: Vector) -> Tensor:

@@ -34,7 +34,8 @@ class HeadMotion:
     def start_from_camera(self, time_s: float) -> NDArray[np.float64]:
         """Pose [4, 4] at a time, in the camera frame of time zero."""
         omega = 2 * np.pi * self.frequency_hz
-        moved = (self.rate / omega * (np.sin(omega * time_s + self.phase) - np.sin(self.phase))).sum(0)
+        swing = np.sin(omega * time_s + self.phase) - np.sin(self.phase)
+        moved = (self.rate / omega * swing).sum(0)
         pose = np.eye(4)
         pose[:3, :3] = rotation(moved[3:])
         pose[:3, 3] = moved[:3]
