@@ -14,6 +14,7 @@ from vergence.transports.grpc import GrpcTransport
 from vergence_proto import codec
 from vergence_proto.errors import BadShape
 from vergence_proto.geometry import Axes, RectifiedRig
+from vergence_proto.keys import DEFAULT_NAMESPACE
 from vergence_proto.types import Delivery, ImageEncoding, OutputFormat, StereoRig
 from vergence_proto.v1 import depth_pb2 as pb
 
@@ -79,7 +80,8 @@ class DepthClient:
         on_event
             Called in the event loop with what happens to the session; must not block.
 
-        Raises BadShape: the stream id. Entering raises BadCalibration, StreamExists, StreamLimit, StateMemory, Draining, NotReady.
+        Raises BadShape: the stream id. Entering raises BadCalibration, StreamExists, StreamLimit,
+        StateMemory, Draining, NotReady.
         """
         opening = pb.OpenStream(
             stream_id=_checked_id(uuid.uuid4().hex if stream_id is None else stream_id),
@@ -124,7 +126,25 @@ def _connector(server: str) -> Callable[[], Transport]:
     host, _, port = address.rpartition(":")
     if scheme == ("grpc" if separator else "") and host and port.isdecimal():
         return partial(GrpcTransport, address)
-    raise ValueError(f"expected a server as grpc://HOST:PORT, got {server!r}")
+    if scheme == "zenoh":
+        return _zenoh_connector(address)
+    raise ValueError(
+        f"expected a server as grpc://HOST:PORT or zenoh://HOST:PORT[/NAMESPACE], got {server!r}"
+    )
+
+
+def _zenoh_connector(address: str) -> Callable[[], Transport]:
+    place, _, namespace = address.partition("/")
+    host, _, port = place.rpartition(":")
+    if not (host and port.isdecimal()):
+        raise ValueError(f"expected a server as zenoh://HOST:PORT[/NAMESPACE], got {address!r}")
+    try:
+        from vergence.transports.zenoh import ZenohTransport
+    except ImportError:
+        raise ValueError(
+            "a zenoh:// server needs Zenoh; install it: pip install 'vergence[zenoh]'"
+        ) from None
+    return partial(ZenohTransport, f"tcp/{place}", namespace or DEFAULT_NAMESPACE)
 
 
 def _checked_id(stream_id: str) -> str:

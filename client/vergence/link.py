@@ -66,10 +66,13 @@ class Link:
         self._runner = asyncio.create_task(self._run(call), name=name)
 
     async def close(self) -> None:
+        """Let the server answer what it has, for a moment, and be done with it."""
         self.end()
-        await asyncio.wait({self._runner}, timeout=_CLOSE_TIMEOUT_S)
-        self._runner.cancel()
-        await asyncio.gather(self._runner, return_exceptions=True)
+        try:
+            await asyncio.wait({self._runner}, timeout=_CLOSE_TIMEOUT_S)
+        finally:
+            self._runner.cancel()
+            await asyncio.gather(self._runner, return_exceptions=True)
 
     def send(self, request: pb.StreamDepthRequest) -> None:
         self._outbox.put_nowait(request)

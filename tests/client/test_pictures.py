@@ -54,6 +54,15 @@ def test_a_missing_answer_is_an_error_where_there_is_truth() -> None:
     np.testing.assert_array_equal(row.panels(SCALE)[2], expected)
 
 
+def test_sparse_truth_is_enlarged_until_it_can_be_seen() -> None:
+    row = make_row(with_truth=True, offset_px=5.0)
+    assert row.truth_px is not None
+    row.truth_px[np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH) % 997 > 0] = np.nan
+    unknown = ERROR_SCALE.paint(np.full((1, 1), np.nan, np.float32))[0, 0]
+    painted = (row.panels(SCALE)[2] != unknown).any(axis=2)
+    assert painted.mean() > 0.1  # of what is known in one pixel of a thousand
+
+
 @pytest.mark.parametrize("with_truth", [True, False], ids=["truth", "no-truth"])
 def test_a_sheet_shows_every_row_in_red_for_a_red_room(with_truth: bool) -> None:
     one, three = (

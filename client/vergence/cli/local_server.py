@@ -2,6 +2,7 @@
 
 import asyncio
 import importlib.util
+import os
 import re
 import sys
 import tempfile
@@ -27,11 +28,15 @@ async def local_server(arguments: Sequence[str] = ()) -> AsyncIterator[str]:
             "the server is not installed here; install it with: pip install 'vergence[server]', "
             "or name a running one with --server HOST:PORT"
         )
-    with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as log:
+    with (
+        tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as log,
+        tempfile.TemporaryDirectory() as jobs,  # not the folder of a server that runs already
+    ):
         process = await asyncio.create_subprocess_exec(
             *(sys.executable, "-m", "vergence_service"),
             *("--grpc-port", "0", "--http-port", "0"),
             *arguments,
+            env={**os.environ, "VERGENCE_BATCH__DIRECTORY": jobs},
             stdout=asyncio.subprocess.PIPE,
             stderr=log,
         )

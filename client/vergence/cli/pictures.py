@@ -22,6 +22,7 @@ _TEXT = (228, 224, 220)
 _FAINT = (150, 144, 138)
 _FONT = cv2.FONT_HERSHEY_DUPLEX
 _MARGIN = 16
+_LARGEST_POINT_PX = 13
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,9 +81,18 @@ class Row:
         panels = [view, scale.paint(self.disparity_px)]
         if self.truth_px is not None:
             # A frame without an answer where there is truth is as wrong as the truth is large.
-            error = np.abs(np.nan_to_num(self.disparity_px, nan=0.0) - self.truth_px)
-            panels.append(ERROR_SCALE.paint(error))
+            error_px = np.abs(np.nan_to_num(self.disparity_px, nan=0.0) - self.truth_px)
+            panels.append(ERROR_SCALE.paint(_spread(error_px)))
         return panels
+
+
+def _spread(error_px: Map) -> Map:
+    """Enlarge the points of a sparse map until they can be seen: each to the gap between them."""
+    known = np.isfinite(error_px)
+    gap_px = min(round(1 / np.sqrt(max(known.mean(), 1e-6))), _LARGEST_POINT_PX)
+    point = np.ones((gap_px, gap_px), np.uint8)
+    spread = cv2.dilate(np.where(known, error_px, np.float32(-1)), point)
+    return np.where(spread < 0, np.float32(np.nan), spread)
 
 
 def sheet(title: str, rows: Sequence[Row], *, panel_width: int = 480) -> Picture:
