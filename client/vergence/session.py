@@ -192,10 +192,15 @@ class DepthSession:
             world_from_left = PoseSample(world_from_left)
         capture_ns = time.monotonic_ns() if capture_ns is None else capture_ns
         frame = StereoFrame(self._next_id, capture_ns, left, right, world_from_left)
-        message = codec.frame_to_proto(
-            frame, encoding=self._encoding, jpeg_quality=self._jpeg_quality, max_age_s=max_age_s
+        request = pb.StreamDepthRequest()
+        codec.frame_to_proto(
+            frame,
+            encoding=self._encoding,
+            jpeg_quality=self._jpeg_quality,
+            max_age_s=max_age_s,
+            into=request.frame,
         )
-        return pb.StreamDepthRequest(frame=message)
+        return request
 
     def _launch(self, flight: Flight) -> None:
         self._next_id += 1

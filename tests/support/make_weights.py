@@ -19,7 +19,10 @@ FOLDER = Path(__file__).parent / "weights"
 
 def make_graph() -> onnx.ModelProto:
     """disparity = 1 / brightness of the left image: not finite where a pixel is black."""
-    image, plane, state = ["B", "H", "W", 3], ["B", "H", "W"], ["B", 1, "H", "W"]
+    image: list[str | int | None] = ["B", "H", "W", 3]
+    plane: list[str | int | None] = ["B", "H", "W"]
+    state: list[str | int | None] = ["B", 1, "H", "W"]
+    motion: list[str | int | None] = ["B", 4, 4]
     nodes = [
         helper.make_node("Cast", [LEFT], ["rgb"], to=TensorProto.FLOAT),
         helper.make_node("ReduceSum", ["rgb", "last"], ["brightness"], keepdims=0),
@@ -30,7 +33,7 @@ def make_graph() -> onnx.ModelProto:
     inputs = [
         helper.make_tensor_value_info(LEFT, TensorProto.UINT8, image),
         helper.make_tensor_value_info(RIGHT, TensorProto.UINT8, image),
-        helper.make_tensor_value_info(MOTION, TensorProto.FLOAT, ["B", 4, 4]),
+        helper.make_tensor_value_info(MOTION, TensorProto.FLOAT, motion),
         helper.make_tensor_value_info("prev_memory", TensorProto.FLOAT, state),
     ]
     outputs = [

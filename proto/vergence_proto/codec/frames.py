@@ -48,15 +48,18 @@ def frame_to_proto(
     encoding: ImageEncoding,
     jpeg_quality: int = 90,
     max_age_s: float | None = None,
+    into: pb.Frame | None = None,
 ) -> pb.Frame:
-    """Raises BadImage or BadPose: the frame holds what no server would take."""
-    message = pb.Frame(
-        frame_id=frame.frame_id,
-        capture_ns=frame.capture_ns,
-        left=image_to_proto(frame.left, encoding, jpeg_quality=jpeg_quality),
-        right=image_to_proto(frame.right, encoding, jpeg_quality=jpeg_quality),
-        max_age_s=max_age_s,
-    )
+    """Encode a pair; ``into`` the field of a larger message if it is to be one, to save a copy.
+
+    Raises BadImage or BadPose: the frame holds what no server would take.
+    """
+    message = pb.Frame() if into is None else into
+    message.frame_id, message.capture_ns = frame.frame_id, frame.capture_ns
+    for image, field in ((frame.left, message.left), (frame.right, message.right)):
+        image_to_proto(image, encoding, jpeg_quality=jpeg_quality, into=field)
+    if max_age_s is not None:
+        message.max_age_s = max_age_s
     if frame.pose is not None:
         message.pose.CopyFrom(pose_sample_to_proto(frame.pose))
     return message

@@ -31,10 +31,16 @@ _JPEG_BARE = frozenset({0x01, *range(0xD0, 0xDA)})
 
 
 def image_to_proto(
-    image: NDArray[np.uint8], encoding: ImageEncoding, *, jpeg_quality: int = 90
+    image: NDArray[np.uint8],
+    encoding: ImageEncoding,
+    *,
+    jpeg_quality: int = 90,
+    into: pb.Image | None = None,
 ) -> pb.Image:
     """Encode uint8 [H, W, 3] RGB, or [H, W] grey, which travels at a third of the size.
 
+    ``into`` is a field of a larger message: protobuf copies a message that is set as a field, and
+    an image is a megabyte.
     Raises BadImage: another type or shape.
     """
     if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)):
@@ -54,7 +60,9 @@ def image_to_proto(
         case ImageEncoding.PNG:
             kind = pb.IMAGE_ENCODING_PNG
             data = _encoded(image, ".png", [cv2.IMWRITE_PNG_COMPRESSION, 1])  # 1: the quickest
-    return pb.Image(encoding=kind, width=width, height=height, data=data)
+    message = pb.Image() if into is None else into
+    message.encoding, message.width, message.height, message.data = kind, width, height, data
+    return message
 
 
 def image_from_proto(message: pb.Image) -> Image:
@@ -103,12 +111,13 @@ def decode_image(data: bytes) -> Image:
 def _from_raw(message: pb.Image) -> Image:
     channels = _CHANNELS[message.encoding]
     expected = message.width * message.height * channels
-    if len(message.data) != expected:
+    data = message.data  # every access copies
+    if len(data) != expected:
         raise BadImage(
             f"{message.width}x{message.height} with {channels} byte(s) a pixel is {expected} bytes "
-            f"without row padding, got {len(message.data)}"
+            f"without row padding, got {len(data)}"
         )
-    pixels = np.frombuffer(message.data, np.uint8).reshape(message.height, message.width, channels)
+    pixels = np.frombuffer(data, np.uint8).reshape(message.height, message.width, channels)
     return pixels if channels == 3 else np.asarray(cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB), "u1")
 
 

@@ -1,13 +1,13 @@
 """One StreamDepth call: a reader, a stepper and a writer, so that they overlap."""
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 from vergence_proto import codec
 from vergence_proto.errors import BadShape, DepthError, FrameTooLarge, StreamExists, UnknownStream
-from vergence_proto.types import DisparityMap
+from vergence_proto.types import DisparityMap, StereoFrame
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.engine import DepthEngine
 from vergence_service.streams import Notice, NoticeKind, Opening, Stream
@@ -67,6 +67,7 @@ class DepthCall:
         self._unsent = asyncio.Semaphore(_UNSENT_MAPS)
         self._reader: asyncio.Task[None] | None = None
         self._stepper: asyncio.Task[None] | None = None
+        self._stream: Stream | None = None
         self._error: DepthError | None = None  # what the call ends with
         self._client_is_done = False
 
@@ -74,6 +75,11 @@ class DepthCall:
         message = pb.Notice(kind=_NOTICE[notice.kind], message=notice.message, in_s=notice.in_s)
         if not self._outbox.full():  # a client that does not read will not read this either
             self._outbox.put_nowait(pb.StreamDepthResponse(notice=message))
+
+    async def tell_lost(self, frame_ids: Sequence[int]) -> None:
+        """Count and answer frames that, as the transport knows, were sent and never came."""
+        if self._stream is not None and frame_ids:
+            await self._drop(self._stream, frame_ids)
 
     def end(self, error: DepthError) -> None:
         """Stop reading and stepping at once, send what is ready, and end with the error."""
@@ -90,6 +96,7 @@ class DepthCall:
     async def run(self) -> None:
         """Serve the call to its end. Raises the DepthError that it ends with, if any."""
         stream, resumed = await self._open()
+        self._stream = stream
         try:
             await self._write(pb.StreamDepthResponse(opened=self._opened(stream, resumed)))
             if self._error is None:
@@ -167,19 +174,19 @@ class DepthCall:
         self, stream: Stream, mailbox: Mailbox[pb.Frame], frame: pb.Frame, arrived_s: float
     ) -> None:
         try:
-            if (size := frame.ByteSize()) > self._limits.max_frame_bytes:
-                raise FrameTooLarge(
-                    f"expected a frame of at most {self._limits.max_frame_bytes} bytes, got {size}"
-                )
             displaced = await mailbox.put(Letter(frame.frame_id, frame, arrived_s))
         except DepthError as error:
             self._engine.count_failed(stream, error)
             await self._refuse(frame.frame_id, error)
             return
         if displaced is not None:
+            await self._drop(stream, [displaced.frame_id])
+
+    async def _drop(self, stream: Stream, frame_ids: Sequence[int]) -> None:
+        for _ in frame_ids:
             self._engine.count_dropped(stream)
-            dropped = pb.FramesDropped(frame_ids=[displaced.frame_id])
-            await self._outbox.put(pb.StreamDepthResponse(frames_dropped=dropped))
+        dropped = pb.FramesDropped(frame_ids=frame_ids)
+        await self._outbox.put(pb.StreamDepthResponse(frames_dropped=dropped))
 
     async def _step(self, stream: Stream, mailbox: Mailbox[pb.Frame]) -> None:
         while True:
@@ -193,7 +200,7 @@ class DepthCall:
                     await self._engine.reset(stream.stream_id)
                 disparity = await self._engine.step(
                     stream.stream_id,
-                    partial(codec.frame_from_proto, frame),
+                    partial(self._decoded, frame, stream),
                     arrived_s=letter.arrived_s,
                     max_age_s=frame.max_age_s if frame.HasField("max_age_s") else None,
                 )
@@ -202,6 +209,14 @@ class DepthCall:
                 await self._refuse(letter.frame_id, error)
             else:
                 await self._outbox.put(_Map(disparity, letter.arrived_s))
+
+    def _decoded(self, frame: pb.Frame, stream: Stream) -> StereoFrame:
+        """Runs in a worker thread: to look at the bytes of an image is to copy them."""
+        size, limit = len(frame.left.data) + len(frame.right.data), self._limits.max_frame_bytes
+        if size > limit:
+            raise FrameTooLarge(f"expected a frame of at most {limit} bytes, got {size}")
+        rig = stream.rectifier.rig
+        return codec.frame_from_proto(frame, size=(rig.width, rig.height))
 
     async def _refuse(self, frame_id: int, error: DepthError) -> None:
         message = codec.error_to_frame_error(frame_id, error)

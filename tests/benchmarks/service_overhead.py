@@ -1,0 +1,202 @@
+"""What the service adds to its model: transport, codec and queueing, side by side in one run.
+
+    python tests/benchmarks/service_overhead.py --json FILE
+
+Every round measures each of these once, so that they share the machine's moods; medians are told.
+
+- ``model_ms``: a warm step of the model in this process, nothing round it.
+- ``service_ms``: the same step through the SDK, loopback gRPC and a real server process, one frame
+  at a time: from the arrays of the images to the array of the disparity.
+- ``overhead_ms``: the median of their differences, round by round.
+- ``bare_grpc_ms``: messages of the same sizes through a gRPC server that only echoes.
+- ``pipelined_ms``: time per frame with as many frames in flight as the credit allows.
+"""
+
+import argparse
+import asyncio
+import json
+import sys
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from statistics import median
+
+import cv2
+import grpc
+import numpy as np
+
+from vergence import Delivery, DepthClient, DepthSession, ImageEncoding
+from vergence_proto import codec
+from vergence_proto.geometry import Pose, RectifiedRig
+from vergence_proto.types import Image, OutputFormat, PoseSample, StereoFrame
+from vergence_service.model import OnnxStereoModel, RecurrentState, Step, View, packaged_weights_dir
+
+RIG = RectifiedRig(640, 480, 500.0, 500.0, 319.5, 319.5, 239.5, 0.1)
+DISPARITY_PX = 12
+STEP_M = 0.01
+ECHO = "/vergence.benchmarks.Echo/Echo"
+
+
+def make_scene(frames: int) -> list[tuple[Image, Image, Pose]]:
+    """A camera that moves along a textured wall: every frame is new, every warp is true."""
+    depth_m = RIG.fx * RIG.baseline_m / DISPARITY_PX
+    step_px = round(RIG.fx * STEP_M / depth_m)
+    noise = np.random.default_rng(0).integers(0, 256, (480, 640 + 64, 3), np.uint8)
+    wall = cv2.GaussianBlur(noise, (0, 0), 1.5)
+    wall = np.ascontiguousarray(cv2.normalize(wall, None, 0, 255, cv2.NORM_MINMAX), np.uint8)
+    scene = []
+    for index in range(frames):
+        start = step_px * (index % 16)  # forth, and back in one jump
+        left, right = (
+            np.ascontiguousarray(wall[:, at : at + 640]) for at in (start, start + DISPARITY_PX)
+        )
+        position_m = np.array([start * depth_m / RIG.fx, 0.0, 0.0])
+        scene.append((left, right, Pose(np.eye(3), position_m)))
+    return scene
+
+
+@asynccontextmanager
+async def serving(threads: int) -> AsyncIterator[str]:
+    """A real server process; yields its gRPC address."""
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "vergence_service"),
+        *("--grpc-port", "0", "--http-port", "0", "--threads", str(threads)),
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.DEVNULL,
+    )
+    assert process.stdout is not None
+    try:
+        _, grpc_address, _ = (await process.stdout.readline()).decode().split()
+        yield grpc_address.removeprefix("grpc=")
+    finally:
+        process.terminate()
+        await process.wait()
+
+
+@asynccontextmanager
+async def echoing(answer_bytes: int) -> AsyncIterator[str]:
+    """A gRPC server process that answers every message with ``answer_bytes`` bytes."""
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, __file__, "--echo", str(answer_bytes)),
+        stdout=asyncio.subprocess.PIPE,
+    )
+    assert process.stdout is not None
+    try:
+        yield (await process.stdout.readline()).decode().strip()
+    finally:
+        process.terminate()
+        await process.wait()
+
+
+async def echo(answer_bytes: int) -> None:
+    answer = bytes(answer_bytes)
+
+    async def serve_stream(requests: AsyncIterator[bytes], _: object) -> AsyncIterator[bytes]:
+        async for _request in requests:
+            yield answer
+
+    handler = grpc.method_handlers_generic_handler(
+        ECHO.split("/")[1], {"Echo": grpc.stream_stream_rpc_method_handler(serve_stream)}
+    )
+    server = grpc.aio.server(options=[("grpc.max_receive_message_length", -1)])
+    server.add_generic_rpc_handlers((handler,))
+    port = server.add_insecure_port("127.0.0.1:0")
+    await server.start()
+    print(f"127.0.0.1:{port}", flush=True)  # noqa: T201
+    await server.wait_for_termination()
+
+
+class BareModel:
+    """The recurrence by itself, as the server runs it."""
+
+    def __init__(self, threads: int) -> None:
+        self._model = OnnxStereoModel(
+            packaged_weights_dir(), "lite", providers=["cpu"], threads=threads, allow_spinning=False
+        )
+        self._iterations = self._model.card.iterations_at_most(1)
+        self._state: RecurrentState | None = None
+
+    def step_s(self, left: Image, right: Image, world_from_left: Pose, capture_ns: int) -> float:
+        view = View(left, right, RIG, capture_ns, world_from_left)
+        started_s = time.perf_counter()
+        [result] = self._model.step([Step(view, self._state, self._iterations)])
+        self._state = result.state
+        return time.perf_counter() - started_s
+
+
+async def measure(args: argparse.Namespace) -> dict[str, float]:
+    scene = make_scene(args.warm_up + args.rounds)
+    left, right, pose = scene[0]
+    encoding = ImageEncoding(args.encoding)
+    request = codec.frame_to_proto(
+        StereoFrame(1, 1, left, right, PoseSample(pose)), encoding=encoding
+    ).SerializeToString()
+    model = BareModel(args.threads)
+    async with (
+        serving(args.threads) as address,
+        DepthClient(f"grpc://{address}") as client,
+        client.open_session(RIG, delivery=Delivery.EVERY, encoding=encoding) as session,
+    ):
+        first = await session.step(left, right, pose)
+        answer = codec.disparity_to_proto(first, OutputFormat()).ByteSize()
+        async with (
+            echoing(answer) as echo_address,
+            grpc.aio.insecure_channel(
+                echo_address, options=[("grpc.max_receive_message_length", -1)]
+            ) as channel,
+        ):
+            bare = channel.stream_stream(ECHO)()
+            rows = []
+            for index, (left, right, pose) in enumerate(scene):
+                model_s = model.step_s(left, right, pose, index)
+                started_s = time.perf_counter()
+                result = await session.step(left, right, pose)
+                service_s = time.perf_counter() - started_s
+                started_s = time.perf_counter()
+                await bare.write(request)
+                await bare.read()
+                bare_s = time.perf_counter() - started_s
+                timings = result.timings
+                rows.append(
+                    (model_s, service_s, service_s - model_s, bare_s, timings.model_s)
+                    + (timings.decode_s, timings.queue_s, timings.encode_s, timings.total_s)
+                )
+            bare.cancel()
+        pipelined_s = await pipelined(session, scene)
+    columns = [median(column) * 1e3 for column in zip(*rows[args.warm_up :], strict=True)]
+    names = ("model", "service", "overhead", "bare_grpc", "server_model")
+    names += ("server_decode", "server_queue", "server_encode", "server_total")
+    figures = {f"{name}_ms": value for name, value in zip(names, columns, strict=True)}
+    figures["pipelined_ms"] = pipelined_s / len(scene) * 1e3
+    figures["overhead_pct"] = 100 * figures["overhead_ms"] / figures["model_ms"]
+    return figures
+
+
+async def pipelined(session: DepthSession, scene: list[tuple[Image, Image, Pose]]) -> float:
+    started_s = time.perf_counter()
+    await asyncio.gather(*(session.step(*frame) for frame in scene))
+    return time.perf_counter() - started_s
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--json", type=Path, help="write the figures there")
+    parser.add_argument("--rounds", type=int, default=60)
+    parser.add_argument("--warm-up", type=int, default=10, help="rounds that are not counted")
+    parser.add_argument("--threads", type=int, default=2, help="of the model, here and there")
+    parser.add_argument("--encoding", choices=[e.value for e in ImageEncoding], default="raw")
+    parser.add_argument("--echo", type=int, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.echo is not None:
+        asyncio.run(echo(args.echo))
+        return
+    figures = {name: round(value, 3) for name, value in asyncio.run(measure(args)).items()}
+    for name, value in figures.items():
+        print(f"{name:18} {value:9.3f}")  # noqa: T201
+    if args.json:
+        args.json.write_text(json.dumps(figures, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
