@@ -13,7 +13,7 @@ from vergence_service.app import Running
 from vergence_service.app import serve as serve_until_stopped
 from vergence_service.model import ProviderUnavailable
 from vergence_service.settings import SettingsError, load_settings
-from vergence_service.transports import PortTaken
+from vergence_service.transports import ExtraMissing, PortTaken, ZenohUnreachable
 
 # What an operator can mend: told in one line, without a trace.
 _OPERATOR_ERRORS = (
@@ -21,6 +21,8 @@ _OPERATOR_ERRORS = (
     ManifestError,
     ProviderUnavailable,
     PortTaken,
+    ExtraMissing,
+    ZenohUnreachable,
     FileNotFoundError,
 )
 
@@ -33,6 +35,9 @@ def serve(
     grpc_port: Annotated[int | None, typer.Option(help="0: a free one.")] = None,
     http_port: Annotated[int | None, typer.Option(help="0: a free one.")] = None,
     host: Annotated[str | None, typer.Option(help="To listen on, for both.")] = None,
+    zenoh: Annotated[
+        bool | None, typer.Option("--zenoh/--no-zenoh", help="Serve over Zenoh too.")
+    ] = None,
     model: Annotated[str | None, typer.Option(help="A model of the manifest.")] = None,
     weights: Annotated[Path | None, typer.Option(help="A folder with a manifest.")] = None,
     threads: Annotated[int | None, typer.Option(help="Of one step; 0: one a core.")] = None,
@@ -48,6 +53,7 @@ def serve(
         "http.port": http_port,
         "grpc.host": host,
         "http.host": host,
+        "zenoh.enabled": zenoh,
         "model.name": model,
         "model.weights": weights,
         "model.threads": threads,

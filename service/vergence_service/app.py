@@ -6,6 +6,7 @@ import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from prometheus_client import CollectorRegistry
 
@@ -16,11 +17,15 @@ from vergence_service.metrics import Metrics
 from vergence_service.model import OnnxStereoModel, StereoModel, packaged_weights_dir
 from vergence_service.settings import Settings
 from vergence_service.streams import StreamTable
+from vergence_service.transports import ExtraMissing
 from vergence_service.transports.calls import OpenCalls
 from vergence_service.transports.grpc_server import DepthServicer, GrpcServer
 from vergence_service.transports.grpc_stream import StreamLimits
 from vergence_service.transports.http_app import HttpServer, make_http_app
 from vergence_service.transports.unary import UnaryMethods
+
+if TYPE_CHECKING:  # Zenoh is an extra
+    from vergence_service.transports.zenoh_server import ZenohServer
 
 _MIB = 1 << 20
 _SWEEP_EVERY_S = 1.0
@@ -34,6 +39,7 @@ class Running:
     http_address: str
     engine: DepthEngine
     grpc: GrpcServer
+    zenoh: "ZenohServer | None"
 
 
 def make_model(settings: Settings) -> OnnxStereoModel:
@@ -53,7 +59,7 @@ async def running(
 ) -> AsyncIterator[Running]:
     """A server from its first listening socket to its last; inside the block it serves.
 
-    Raises PortTaken, and what the model raises when it loads.
+    Raises PortTaken, ExtraMissing, ZenohUnreachable, and what the model raises when it loads.
     """
     registry = CollectorRegistry()
     metrics = Metrics(registry)
@@ -85,12 +91,15 @@ async def running(
         max_frame_bytes=max_frame_bytes,
     )
     unary = UnaryMethods(engine, provider=model.provider, max_frame_bytes=max_frame_bytes)
-    servicer = DepthServicer(unary, OpenCalls(engine, limits=limits, clock=clock))
+
+    def open_calls() -> OpenCalls:
+        return OpenCalls(engine, limits=limits, clock=clock)
+
     # Outermost ends last: no transport outlives the batcher that it feeds.
     async with (
         batcher,
         GrpcServer(
-            servicer,
+            DepthServicer(unary, open_calls()),
             host=settings.grpc.host,
             port=settings.grpc.port,
             max_frame_bytes=max_frame_bytes,
@@ -100,15 +109,19 @@ async def running(
             host=settings.http.host,
             port=settings.http.port,
         ) as http_server,
+        _on_zenoh(settings, unary, open_calls(), max_frame_bytes) as zenoh_server,
         _sweeping(streams),
     ):
         await engine.start()
         await grpc_server.serving()
+        if zenoh_server is not None:
+            await zenoh_server.serving()
         yield Running(
             f"{settings.grpc.host}:{grpc_server.port}",
             f"{settings.http.host}:{http_server.port}",
             engine,
             grpc_server,
+            zenoh_server,
         )
 
 
@@ -127,7 +140,34 @@ async def serve(settings: Settings, *, on_serving: Callable[[Running], None]) ->
 async def drain(server: Running, *, within_s: float) -> None:
     """Tell clients, let them leave, answer what they have sent; within twice the time given."""
     server.engine.drain(within_s=within_s)
-    await server.grpc.drain(within_s=within_s)
+    async with asyncio.TaskGroup() as tasks:
+        tasks.create_task(server.grpc.drain(within_s=within_s))
+        if server.zenoh is not None:
+            tasks.create_task(server.zenoh.drain(within_s=within_s))
+
+
+@asynccontextmanager
+async def _on_zenoh(
+    settings: Settings, unary: UnaryMethods, calls: OpenCalls, max_frame_bytes: int
+) -> AsyncIterator["ZenohServer | None"]:
+    """Raises ExtraMissing, ZenohUnreachable."""
+    if not settings.zenoh.enabled:
+        yield None
+        return
+    try:
+        from vergence_service.transports.zenoh_server import ZenohServer, zenoh_config
+    except ImportError:
+        raise ExtraMissing("Zenoh", "zenoh") from None
+    chosen = settings.zenoh
+    config = zenoh_config(
+        chosen.config,
+        mode=chosen.mode,
+        listen=chosen.listen,
+        connect=chosen.connect,
+        max_frame_bytes=max_frame_bytes,
+    )
+    async with ZenohServer(unary, calls, config=config, namespace=chosen.namespace) as server:
+        yield server
 
 
 @asynccontextmanager

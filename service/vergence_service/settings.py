@@ -42,6 +42,40 @@ class HttpSettings(_Section):
     port: int = Field(default=8000, ge=0, le=65535, description="0: a free one")
 
 
+class BatchSettings(_Section):
+    directory: Path | None = Field(
+        default=None, description="of jobs and results; $XDG_STATE_HOME/vergence/batch"
+    )
+    waiting: PositiveInt = Field(default=64, description="sequences, the running one included")
+    keep_h: PositiveFloat = Field(default=24.0, description="results, unless space runs short")
+    disk_mib: PositiveInt = Field(default=20_480, description="of all jobs together")
+    max_upload_mib: PositiveInt = 4096
+    max_unpacked_mib: PositiveInt = 8192
+    max_files: PositiveInt = Field(default=100_000, description="in one upload")
+    max_ratio: PositiveFloat = Field(default=100.0, description="of unpacked to uploaded size")
+    idle_s: PositiveFloat = Field(default=30.0, description="before a silent upload is given up")
+
+
+class ZenohSettings(_Section):
+    enabled: bool = False
+    namespace: str = Field(
+        default="vergence",
+        pattern=r"^[\w.-]+(/[\w.-]+)*$",
+        description="the first chunks of every key",
+    )
+    mode: Literal["router", "peer", "client"] = Field(
+        default="router", description="client or peer: joins the routers of connect"
+    )
+    listen: tuple[str, ...] = Field(
+        default=("tcp/127.0.0.1:7447",), description="endpoints; not for a client"
+    )
+    connect: tuple[str, ...] = Field(default=(), description="endpoints of routers and peers")
+    config: Path | None = Field(
+        default=None,
+        description="a Zenoh JSON5 file, for TLS and access control; instead of mode and endpoints",
+    )
+
+
 class ModelSettings(_Section):
     name: str = "lite"
     weights: Path | None = Field(
@@ -90,6 +124,8 @@ class Settings(BaseSettings):
 
     grpc: GrpcSettings = GrpcSettings()
     http: HttpSettings = HttpSettings()
+    zenoh: ZenohSettings = ZenohSettings()
+    batch: BatchSettings = BatchSettings()
     model: ModelSettings = ModelSettings()
     streams: StreamSettings = StreamSettings()
     continuity: ContinuitySettings = ContinuitySettings()

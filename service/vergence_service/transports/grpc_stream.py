@@ -7,7 +7,7 @@ from functools import partial
 
 from vergence_proto import codec
 from vergence_proto.errors import BadShape, DepthError, FrameTooLarge, StreamExists, UnknownStream
-from vergence_proto.types import DisparityMap, StereoFrame
+from vergence_proto.types import DisparityMap
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.engine import DepthEngine
 from vergence_service.streams import Notice, NoticeKind, Opening, Stream
@@ -174,6 +174,10 @@ class DepthCall:
         self, stream: Stream, mailbox: Mailbox[pb.Frame], frame: pb.Frame, arrived_s: float
     ) -> None:
         try:
+            if (size := frame.ByteSize()) > self._limits.max_frame_bytes:
+                raise FrameTooLarge(
+                    f"expected a frame of at most {self._limits.max_frame_bytes} bytes, got {size}"
+                )
             displaced = await mailbox.put(Letter(frame.frame_id, frame, arrived_s))
         except DepthError as error:
             self._engine.count_failed(stream, error)
@@ -200,7 +204,7 @@ class DepthCall:
                     await self._engine.reset(stream.stream_id)
                 disparity = await self._engine.step(
                     stream.stream_id,
-                    partial(self._decoded, frame, stream),
+                    partial(codec.frame_from_proto, frame),
                     arrived_s=letter.arrived_s,
                     max_age_s=frame.max_age_s if frame.HasField("max_age_s") else None,
                 )
@@ -209,14 +213,6 @@ class DepthCall:
                 await self._refuse(letter.frame_id, error)
             else:
                 await self._outbox.put(_Map(disparity, letter.arrived_s))
-
-    def _decoded(self, frame: pb.Frame, stream: Stream) -> StereoFrame:
-        """Runs in a worker thread: to look at the bytes of an image is to copy them."""
-        size, limit = len(frame.left.data) + len(frame.right.data), self._limits.max_frame_bytes
-        if size > limit:
-            raise FrameTooLarge(f"expected a frame of at most {limit} bytes, got {size}")
-        rig = stream.rectifier.rig
-        return codec.frame_from_proto(frame, size=(rig.width, rig.height))
 
     async def _refuse(self, frame_id: int, error: DepthError) -> None:
         message = codec.error_to_frame_error(frame_id, error)

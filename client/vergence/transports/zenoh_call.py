@@ -1,0 +1,197 @@
+"""One attachment to a stream over Zenoh: a StreamDepth call made of keys."""
+
+import secrets
+from collections import deque
+from collections.abc import Awaitable, Callable, Iterable
+from contextlib import suppress
+
+import zenoh
+from google.protobuf.message import Message
+from google.rpc import status_pb2
+
+from vergence.transports.base import ConnectionLost
+from vergence_proto import codec
+from vergence_proto.errors import (
+    DepthError,
+    Draining,
+    FrameTooLarge,
+    ModelFailed,
+    NotReady,
+    Quota,
+    StateMemory,
+    StreamLimit,
+)
+from vergence_proto.keys import ANY, OPEN, StreamKeys, ask_key, server_key
+from vergence_proto.v1 import depth_pb2 as pb
+from vergence_proto.zenoh_inbox import Inbox
+from vergence_proto.zenoh_peer import Undeclarable, ZenohPeer
+
+ServerInfos = dict[str, pb.GetServerInfoResponse]  # by server id, best first
+
+_OPEN_TIMEOUT_S = 5.0
+# No more maps are on the way than the server gives credit; past this the oldest would give way.
+_WAITING_MAPS = 16
+# The server would take the stream, had it room: another may have.
+_NO_ROOM = (StreamLimit, StateMemory, Draining, NotReady)
+
+
+class ZenohCall:
+    """A :class:`~vergence.transports.base.Call`.
+
+    A live frame may be lost on the way, and so may its answer; both are found out and told as
+    ``FramesDropped``, so every frame is answered here as it is over gRPC. Maps come in order, so
+    the one that comes tells which were lost before it; and each pong says which frames are still
+    to be answered, so that the last ones are not waited for in vain.
+    """
+
+    def __init__(
+        self,
+        peer: ZenohPeer,
+        namespace: str,
+        stream_id: str,
+        find_servers: Callable[[bool], Awaitable[ServerInfos]],
+    ) -> None:
+        self.stream_id = stream_id
+        self.server_id = ""  # where the stream is open
+        self.over = False  # the server has ended the call; it was not lost
+        self._peer = peer
+        self._namespace = namespace
+        self._keys = StreamKeys(namespace, stream_id)
+        self._find_servers = find_servers
+        self._attachment_id = secrets.token_hex(8)
+        self._inbox = Inbox(
+            self._attachment_id, bulky=pb.DisparityMap, room=_WAITING_MAPS, displaces=True
+        )
+        self._declared: list[Undeclarable] = []
+        self._ready: deque[pb.StreamDepthResponse] = deque()
+        self._live = True
+        self._max_frame_bytes = 0
+        self._unanswered: dict[int, None] = {}  # frame ids, in order
+        self._sent_before: dict[int, int] = {}  # by ping: the last frame before it
+
+    async def send(self, request: pb.StreamDepthRequest) -> None:
+        try:
+            match request.WhichOneof("message"):
+                case "open":
+                    await self._open(request.open)
+                case "frame":
+                    await self._send_frame(request.frame)
+                case "ping":
+                    self._sent_before[request.ping.client_ns] = max(self._unanswered, default=0)
+                    await self._put(request.ping, may_drop=self._live)
+                case "reset":
+                    await self._put(request.reset)
+                case "end":
+                    await self._put(request.end)
+        except zenoh.ZError as error:
+            self.lose(str(error))
+        except DepthError as error:
+            self._inbox.end(error)
+
+    async def receive(self) -> pb.StreamDepthResponse | None:
+        while not self._ready:
+            try:
+                message = await self._inbox.take()
+            except Quota as error:
+                raise ConnectionLost(f"the server sent more than was asked for: {error}") from None
+            match message:
+                case pb.DisparityMap():
+                    self._take_map(message)
+                case pb.StreamDepthResponse():
+                    self._take_status(message)
+                case pb.End():
+                    self.over = True
+                    return None
+                case status_pb2.Status():
+                    self.over = True
+                    raise codec.error_from_status(message) or ModelFailed(message.message)
+        return self._ready.popleft()
+
+    async def close(self) -> None:
+        self.lose("the call was closed")
+        with suppress(RuntimeError):  # the session is closed, and all is gone with it
+            await self._peer.undeclare(*self._declared)
+
+    def lose(self, why: str) -> None:
+        """End the call, for a session to resume it."""
+        self._inbox.end(ConnectionLost(why))
+
+    async def _open(self, opening: pb.OpenStream) -> None:
+        self._live = opening.delivery != pb.DELIVERY_EVERY
+        servers = await self._find_servers(bool(opening.resume_token))
+        peer, declared = self._peer, self._declared
+        declared.append(await peer.subscribe(self._keys.disparity, self._inbox.put))
+        declared.append(await peer.subscribe(self._keys.status, self._inbox.put))
+        declared.append(
+            await peer.watch_deaths(server_key(self._namespace, ANY), self._server_died)
+        )
+        declared.append(await peer.declare_alive(self._keys.client(self._attachment_id)))
+        refusal: DepthError = ConnectionLost("no server answers")
+        for self.server_id, info in servers.items():
+            key = ask_key(self._namespace, self.server_id, OPEN)
+            answers = await peer.ask(
+                key, opening, timeout_s=_OPEN_TIMEOUT_S, attachment_id=self._attachment_id
+            )
+            if not answers:
+                refusal = ConnectionLost(f"server {self.server_id} did not answer")
+                continue
+            error = answers[0].error
+            if error is None:
+                self._max_frame_bytes = info.max_message_bytes
+                opened = pb.StreamOpened.FromString(answers[0].payload)
+                self._inbox.put_own(pb.StreamDepthResponse(opened=opened))
+                return
+            refusal = error
+            if not isinstance(error, _NO_ROOM):
+                break
+        raise refusal
+
+    def _server_died(self, key: str) -> None:
+        if key == server_key(self._namespace, self.server_id):
+            self.lose(f"server {self.server_id} is gone, or the way to it")
+
+    async def _send_frame(self, frame: pb.Frame) -> None:
+        # Past its limit a server's Zenoh link breaks off without a word.
+        if (size := frame.ByteSize()) > self._max_frame_bytes:
+            error = FrameTooLarge(
+                f"expected a frame of at most {self._max_frame_bytes} bytes, got {size}"
+            )
+            refusal = codec.error_to_frame_error(frame.frame_id, error)
+            self._inbox.put_own(pb.StreamDepthResponse(frame_error=refusal))
+            return
+        self._unanswered[frame.frame_id] = None
+        await self._put(frame, may_drop=self._live)
+
+    async def _put(self, message: Message, *, may_drop: bool = False) -> None:
+        await self._peer.put(
+            self._keys.frames, message, attachment_id=self._attachment_id, may_drop=may_drop
+        )
+
+    def _take_map(self, message: pb.DisparityMap) -> None:
+        self._tell_lost(frame_id for frame_id in self._unanswered if frame_id < message.frame_id)
+        self._unanswered.pop(message.frame_id, None)
+        self._ready.append(pb.StreamDepthResponse(disparity=message))
+
+    def _take_status(self, message: pb.StreamDepthResponse) -> None:
+        match message.WhichOneof("message"):
+            case "frame_error":
+                self._unanswered.pop(message.frame_error.frame_id, None)
+            case "frames_dropped":
+                for frame_id in message.frames_dropped.frame_ids:
+                    self._unanswered.pop(frame_id, None)
+            case "pong":
+                last = self._sent_before.pop(message.pong.client_ns, 0)
+                waiting = set(message.pong.unanswered_frame_ids)
+                self._tell_lost(
+                    frame_id
+                    for frame_id in self._unanswered
+                    if frame_id <= last and frame_id not in waiting
+                )
+        self._ready.append(message)
+
+    def _tell_lost(self, frame_ids: Iterable[int]) -> None:
+        if lost := list(frame_ids):
+            for frame_id in lost:
+                del self._unanswered[frame_id]
+            dropped = pb.FramesDropped(frame_ids=lost)
+            self._ready.append(pb.StreamDepthResponse(frames_dropped=dropped))
