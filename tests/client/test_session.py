@@ -380,3 +380,26 @@ async def test_a_stream_can_be_closed_by_somebody_else(client: DepthClient) -> N
         assert (await client.server_info()).streams_open == 0
         with pytest.raises(UnknownStream):
             await step(session, 2)
+
+
+async def test_every_submitted_frame_is_accounted_for(client: DepthClient) -> None:
+    async def film(session: DepthSession) -> None:
+        for frame_id in range(1, 101):
+            submit(session, frame_id, brightness=RAISES if frame_id % 10 == 0 else 64)
+            await asyncio.sleep(0.001 * (frame_id % 3))
+        session.end()
+
+    results = errors = 0
+    async with client.open_session(RIG) as session:
+        camera = asyncio.create_task(film(session))
+        while True:
+            try:
+                await anext(session)
+                results += 1
+            except ModelFailed:
+                errors += 1
+            except StopAsyncIteration:
+                break
+        await camera
+    assert results > 0
+    assert results + errors + session.drops.total == 100
