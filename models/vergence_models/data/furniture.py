@@ -155,8 +155,10 @@ def plant(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> N
 def leaf_material(palette: Palette, rng: np.random.Generator, s: float) -> Material:
     green = np.array([0.25, 0.5, 0.2]) * rng.uniform(0.5, 1.4) + rng.normal(0, 0.05, 3)
     r, g, c = (float(x) for x in np.clip(green, 0.02, 0.9))
-    gain = (0.25 * r + 0.05, 0.25 * g + 0.1, 0.25 * c + 0.05)
-    return Material(palette.texture("clouds", "speckle", "stones"), 0.4 * s, gain, (r, g, c))
+    contrast = rng.uniform(0.1, 0.6)
+    gain = (contrast * r + 0.05, contrast * g + 0.1, contrast * c + 0.05)
+    span_m = rng.uniform(0.08, 0.5) * s
+    return Material(palette.texture("clouds", "speckle", "stones"), span_m, gain, (r, g, c))
 
 
 def floor_lamp(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> None:
@@ -200,13 +202,14 @@ def tree(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> No
     trunk, h = rng.uniform(0.08, 0.25) * s, rng.uniform(1.5, 3.0) * s
     b.post((0, -h / 2, 0), trunk, h / 2, palette.textured(0.5 * s, "wood", "clouds"), taper=-0.2)
     leaf = leaf_material(palette, rng, 4 * s)
-    for _ in range(int(rng.integers(3, 7))):
+    for _ in range(int(rng.integers(2, 6))):
         at = rng.normal(0, 0.7, 3) * s - (0, h + 0.6 * s, 0)
-        b.ball(at, rng.uniform(0.5, 1.2, 3) * s, leaf)
-    for _ in range(int(rng.integers(4, 14))):
+        b.ball(at, rng.uniform(0.3, 1.0, 3) * s, leaf)
+    for _ in range(int(rng.integers(10, 45))):
         turned = look_along(rng.normal(0, 1, 3))
-        at = rng.normal(0, 1.1, 3) * s - (0, h + 0.4 * s, 0)
-        b.add(Shape.QUAD, at, (0.15 * s, 0.35 * s, 1.0), leaf, rotation=turned, cutout=Cutout.LEAF)
+        at = rng.normal(0, 1.0, 3) * s - (0, h + 0.5 * s, 0)
+        half = (0.2 * s, rng.uniform(0.2, 0.45) * s, 1.0)
+        b.add(Shape.QUAD, at, half, leaf, rotation=turned, cutout=Cutout.LEAF)
 
 
 def car(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> None:

@@ -68,7 +68,7 @@ class Palette:
         bias = rng.uniform(0, 1) * np.maximum(0.9 - gain, 0)
         return Material(
             self.texture(*kinds) if kinds else int(rng.choice(self._all)),
-            float(size_m * np.exp(rng.uniform(np.log(0.4), np.log(1.6)))),
+            float(size_m * np.exp(rng.uniform(np.log(0.25), np.log(1.5)))),
             tuple(gain), tuple(bias), tuple(rng.uniform(0, 1, 2)),
             specular=self._gloss(0.3), shininess=float(np.exp(rng.uniform(1.5, 5))),
         )  # fmt: skip

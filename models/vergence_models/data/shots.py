@@ -7,9 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from vergence_models.data.materials import Palette
+from vergence_models.data.outdoors import street, swarm
 from vergence_models.data.render import Shot
+from vergence_models.data.rooms import clutter, room
 from vergence_models.data.scenes import Scene
-from vergence_models.data.settings import Viewpoint, room, street, swarm
+from vergence_models.data.settings import Viewpoint
 from vergence_models.data.trajectories import HeadMotion, rotation
 
 
@@ -18,7 +20,8 @@ class Mix:
     """Shares of the kinds of scene; the rest are rooms."""
 
     streets: float = 0.13
-    swarms: float = 0.2
+    swarms: float = 0.18
+    clutter: float = 0.2
 
 
 def draw_shot(
@@ -54,6 +57,8 @@ def draw_shot(
         scene, camera_height_m = street(rng, palette, view)
     elif draw < mix.streets + mix.swarms:
         scene, camera_height_m = swarm(rng, palette, view)
+    elif draw < mix.streets + mix.swarms + mix.clutter:
+        scene, camera_height_m = clutter(rng, palette, view)
     else:
         scene, camera_height_m = room(rng, palette, view)
     world_from_start[1, 3] = -camera_height_m
