@@ -1,18 +1,25 @@
 """The composition root: settings in, a running server out."""
 
 import asyncio
+import logging
+import os
 import signal
 import time
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from prometheus_client import CollectorRegistry
 
+from vergence_service.archives import ArchiveLimits
 from vergence_service.batcher import StepBatcher
 from vergence_service.continuity import ContinuityLimits
 from vergence_service.engine import DepthEngine
+from vergence_service.job_queue import JobQueue, QueueLimits
+from vergence_service.jobs import JobStore, StoreUnavailable
 from vergence_service.metrics import Metrics
 from vergence_service.model import OnnxStereoModel, StereoModel, packaged_weights_dir
 from vergence_service.settings import Settings
@@ -22,7 +29,12 @@ from vergence_service.transports.calls import OpenCalls
 from vergence_service.transports.grpc_server import DepthServicer, GrpcServer
 from vergence_service.transports.grpc_stream import StreamLimits
 from vergence_service.transports.http_app import HttpServer, make_http_app
+from vergence_service.transports.http_pairs import pair_routes
+from vergence_service.transports.http_sequences import no_sequence_routes, sequence_routes
+from vergence_service.transports.http_uploads import UploadLimits
 from vergence_service.transports.unary import UnaryMethods
+
+log = logging.getLogger(__name__)
 
 if TYPE_CHECKING:  # Zenoh is an extra
     from vergence_service.transports.zenoh_server import ZenohServer
@@ -104,15 +116,12 @@ async def running(
             port=settings.grpc.port,
             max_frame_bytes=max_frame_bytes,
         ) as grpc_server,
-        HttpServer(
-            make_http_app(ready=lambda: engine.ready, registry=registry),
-            host=settings.http.host,
-            port=settings.http.port,
-        ) as http_server,
+        _serving_http(settings, engine, registry) as (http_server, start_jobs),
         _on_zenoh(settings, unary, open_calls(), max_frame_bytes) as zenoh_server,
         _sweeping(streams),
     ):
         await engine.start()
+        start_jobs()
         await grpc_server.serving()
         if zenoh_server is not None:
             await zenoh_server.serving()
@@ -168,6 +177,73 @@ async def _on_zenoh(
     )
     async with ZenohServer(unary, calls, config=config, namespace=chosen.namespace) as server:
         yield server
+
+
+@asynccontextmanager
+async def _serving_http(
+    settings: Settings, engine: DepthEngine, registry: CollectorRegistry
+) -> AsyncIterator[tuple[HttpServer, Callable[[], None]]]:
+    """The HTTP face, and what starts its jobs once the model is there."""
+    batch = settings.batch
+    archive = ArchiveLimits(
+        max_files=batch.max_files,
+        max_unpacked_bytes=batch.max_unpacked_mib * _MIB,
+        max_ratio=batch.max_ratio,
+    )
+    upload = UploadLimits(
+        max_bytes=batch.max_upload_mib * _MIB, idle_s=batch.idle_s, archive=archive
+    )
+    pair = UploadLimits(
+        max_bytes=2 * settings.grpc.max_frame_mib * _MIB,
+        idle_s=batch.idle_s,
+        archive=replace(archive, max_files=2),
+    )
+    stopping = asyncio.Event()
+    async with AsyncExitStack() as stack:
+        routes = [pair_routes(engine, limits=pair)]
+        start: Callable[[], None]
+        try:
+            store = stack.enter_context(JobStore(batch.directory or _default_jobs_directory()))
+        except StoreUnavailable as error:
+            # Live depth is worth serving without a disk.
+            log.warning("sequences are not taken: %s", error)
+            routes.append(no_sequence_routes(str(error)))
+            start = _nothing
+        else:
+            queue = await stack.enter_async_context(
+                JobQueue(
+                    engine,
+                    store,
+                    limits=QueueLimits(
+                        waiting=batch.waiting,
+                        keep_s=batch.keep_h * 3600,
+                        disk_bytes=batch.disk_mib * _MIB,
+                    ),
+                )
+            )
+            routes.append(
+                sequence_routes(queue, model=engine.card.name, limits=upload, stopping=stopping)
+            )
+            start = queue.start
+        app = make_http_app(
+            version=version("vergence"),
+            ready=lambda: engine.ready,
+            registry=registry,
+            routes=routes,
+        )
+        server = await stack.enter_async_context(
+            HttpServer(app, host=settings.http.host, port=settings.http.port, stopping=stopping)
+        )
+        yield server, start
+
+
+def _nothing() -> None:
+    """No jobs are to be started."""
+
+
+def _default_jobs_directory() -> Path:
+    state = os.environ.get("XDG_STATE_HOME")
+    return (Path(state) if state else Path.home() / ".local" / "state") / "vergence" / "batch"
 
 
 @asynccontextmanager

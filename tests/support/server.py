@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import grpc
@@ -36,15 +37,17 @@ async def running_server(
     model: StereoModel, *, clock: ManualClock | None = None, **flags: Any
 ) -> AsyncIterator[Running]:
     """A server with ``model`` on free ports. Flags are settings with ``__`` for the dot."""
-    settings = load_settings(
-        flags={
-            "grpc.port": 0,
-            "http.port": 0,
-            **{name.replace("__", "."): value for name, value in flags.items()},
-        }
-    )
-    async with running(settings, model, **({"clock": clock} if clock else {})) as server:
-        yield server
+    with TemporaryDirectory() as jobs:
+        settings = load_settings(
+            flags={
+                "grpc.port": 0,
+                "http.port": 0,
+                "batch.directory": jobs,
+                **{name.replace("__", "."): value for name, value in flags.items()},
+            }
+        )
+        async with running(settings, model, **({"clock": clock} if clock else {})) as server:
+            yield server
 
 
 @dataclass(eq=False)

@@ -1,0 +1,185 @@
+"""A zip or tar from a stranger, unpacked into a folder of its own, or refused.
+
+Nothing in the archive is believed: sizes are counted as bytes come out, names may only lead
+downward, and what is neither a file nor a folder is refused.
+"""
+
+import bz2
+import gzip
+import lzma
+import stat
+import tarfile
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from io import BufferedIOBase
+from pathlib import Path, PurePosixPath
+from typing import IO, cast
+
+from vergence_proto.errors import BadSequence, UploadTooLarge
+
+_CHUNK = 1 << 20
+_LONGEST_NAME = 512
+_ZIP_START = b"PK\x03\x04"
+_DECOMPRESSORS: dict[bytes, Callable[[Path], BufferedIOBase]] = {
+    b"\x1f\x8b": gzip.GzipFile,
+    b"BZh": bz2.BZ2File,
+    b"\xfd7zXZ": lzma.LZMAFile,
+}
+# What the standard library raises about archives that are damaged or made to confuse it.
+_DAMAGED = (
+    zipfile.BadZipFile,
+    tarfile.TarError,
+    zlib.error,
+    lzma.LZMAError,
+    EOFError,
+    NotImplementedError,  # a compression that zipfile does not know
+    gzip.BadGzipFile,
+    UnicodeError,
+    ValueError,
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ArchiveLimits:
+    max_files: int
+    max_unpacked_bytes: int
+    # Images are compressed already: an archive of them hardly shrinks, one of zeros a thousandfold.
+    max_ratio: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Member:
+    name: str
+    declared_bytes: int
+    open: Callable[[], IO[bytes]]
+
+
+def unpack(archive: Path, folder: Path, limits: ArchiveLimits) -> None:
+    """Unpack into ``folder``, which the caller removes if this raises.
+
+    Raises BadSequence: no zip or tar, damaged, encrypted, links, or names that lead elsewhere.
+    Raises UploadTooLarge: more files, bytes or compression than ``limits`` allow.
+    """
+    with archive.open("rb") as file:
+        start = file.read(8)
+    allowed = min(limits.max_unpacked_bytes, round(limits.max_ratio * archive.stat().st_size))
+    budget = _Budget(limits, allowed)
+    members = _zip_members if start.startswith(_ZIP_START) else _tar_members
+    try:
+        for member in members(archive, start):
+            budget.take_file(member)
+            _write(member, _place(folder, member.name), budget)
+    except _DAMAGED as error:
+        raise BadSequence(f"expected a whole zip or tar archive: {error}") from None
+
+
+class _Budget:
+    """What may still come out of the archive."""
+
+    def __init__(self, limits: ArchiveLimits, allowed_bytes: int) -> None:
+        self._limits = limits
+        self._files = 0
+        self._bytes = 0
+        self._allowed_bytes = allowed_bytes
+
+    def take_file(self, member: _Member) -> None:
+        self._files += 1
+        if self._files > self._limits.max_files:
+            raise UploadTooLarge(f"expected at most {self._limits.max_files} files in the archive")
+        self._check(self._bytes + member.declared_bytes)
+
+    def take_bytes(self, count: int) -> None:
+        self._bytes += count
+        self._check(self._bytes)
+
+    def _check(self, count: int) -> None:
+        if count > self._allowed_bytes:
+            raise UploadTooLarge(
+                f"the archive unpacks to more than {self._allowed_bytes} bytes; at most "
+                f"{self._limits.max_unpacked_bytes} are taken, and at most "
+                f"{self._limits.max_ratio:g} times the archive's size"
+            )
+
+
+def _place(folder: Path, name: str) -> Path:
+    """Where a member goes. Raises BadSequence: not below ``folder``."""
+    path = PurePosixPath(name)
+    parts = [part for part in path.parts if part != "."]
+    bad = not parts or path.is_absolute() or len(name) > _LONGEST_NAME
+    if bad or any(part == ".." or set(part) & set("\\:\0") for part in parts):
+        raise BadSequence(
+            f"expected names that lead below the archive's own folder, got {name[:100]!r}"
+        )
+    return folder.joinpath(*parts)
+
+
+def _write(member: _Member, path: Path, budget: _Budget) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with member.open() as source, path.open("xb") as target:
+            while chunk := source.read(_CHUNK):
+                budget.take_bytes(len(chunk))
+                target.write(chunk)
+    except (FileExistsError, NotADirectoryError, IsADirectoryError):
+        raise BadSequence(f"the archive holds {member.name!r} twice") from None
+
+
+def _zip_members(archive: Path, start: bytes) -> Iterator[_Member]:
+    with zipfile.ZipFile(archive) as file:
+        for info in file.infolist():
+            if info.is_dir():
+                continue
+            kind = stat.S_IFMT(info.external_attr >> 16)
+            if kind not in (0, stat.S_IFREG):
+                raise BadSequence(f"expected files and folders only, {info.filename!r} is a link")
+            if info.flag_bits & 1:
+                raise BadSequence(f"expected an archive without a password: {info.filename!r}")
+            yield _Member(info.filename, info.file_size, _opener(file, info))
+
+
+def _opener(file: zipfile.ZipFile, info: zipfile.ZipInfo) -> Callable[[], IO[bytes]]:
+    return lambda: file.open(info)
+
+
+def _tar_members(archive: Path, start: bytes) -> Iterator[_Member]:
+    opened = next(
+        (
+            decompressor(archive)
+            for magic, decompressor in _DECOMPRESSORS.items()
+            if start.startswith(magic)
+        ),
+        None,
+    ) or archive.open("rb")
+    small_reads = cast(IO[bytes], _SmallReads(opened))  # it has all that reading a tar needs
+    with opened, tarfile.open(fileobj=small_reads, mode="r:") as file:
+        for info in file:
+            if info.isdir():
+                continue
+            content = file.extractfile(info) if info.isreg() and not info.issparse() else None
+            if content is None:
+                raise BadSequence(f"expected files and folders only, {info.name!r} is another kind")
+            yield _Member(info.name, info.size, _same(content))
+
+
+def _same(content: IO[bytes]) -> Callable[[], IO[bytes]]:
+    return lambda: content
+
+
+class _SmallReads:
+    """tarfile reads the extended header of a member whole, however long it says that it is."""
+
+    def __init__(self, file: BufferedIOBase) -> None:
+        self._file = file
+
+    def read(self, size: int) -> bytes:
+        if size > _CHUNK:
+            raise BadSequence(f"a header of {size} bytes in a tar archive")
+        return self._file.read(size)
+
+    def seek(self, offset: int) -> int:
+        return self._file.seek(offset)
+
+    def tell(self) -> int:
+        return self._file.tell()

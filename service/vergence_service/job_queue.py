@@ -1,0 +1,351 @@
+"""Sequences that were accepted: run in order, kept for a while, and told about."""
+
+import asyncio
+import logging
+import secrets
+import time
+from collections import Counter
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Self
+
+from vergence_proto.errors import (
+    DepthError,
+    Draining,
+    ModelFailed,
+    NotReady,
+    QueueFull,
+    SequenceNotDone,
+    UnknownSequence,
+    UploadTooLarge,
+)
+from vergence_proto.layouts import StereoSource
+from vergence_service.engine import DepthEngine
+from vergence_service.job_run import opening_of, run_job
+from vergence_service.jobs import (
+    Job,
+    JobOptions,
+    JobState,
+    JobStore,
+    Output,
+    folder_bytes,
+    remove_folder,
+)
+from vergence_service.sequences import find_sequence, open_below
+
+log = logging.getLogger(__name__)
+
+# A sequence that was running so often when the server died is taken to be the cause.
+_MAX_ATTEMPTS = 4
+_EXPIRE_EVERY_S = 30.0
+# What a job is taken to need where none has run yet; clients are told to come back after it.
+_USUAL_JOB_S = 10.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class QueueLimits:
+    waiting: int  # jobs, the running ones included
+    keep_s: float  # what has ended
+    disk_bytes: int  # of all jobs together
+
+
+@dataclass(frozen=True, slots=True)
+class JobStatus:
+    """A job and how far it is."""
+
+    job: Job
+    frames_done: int
+    ahead: int  # jobs that run before it
+    fps: float | None
+    eta_s: float | None  # of its own frames
+
+
+@dataclass(slots=True, eq=False)
+class _Running:
+    since_s: float
+    task: asyncio.Task[None]
+    frames_done: int = 0
+
+
+class JobQueue:
+    """Runs one job at a time, so that a sequence is done as early as it can be.
+
+    Use it inside ``async with``; jobs run from :meth:`start` on. All of its methods belong to the
+    event loop; files and the database are touched in threads.
+    """
+
+    def __init__(self, engine: DepthEngine, store: JobStore, *, limits: QueueLimits) -> None:
+        self._engine = engine
+        self._store = store
+        self._limits = limits
+        self._jobs: dict[str, Job] = {}  # as the store has them, oldest first
+        self._running: tuple[str, _Running] | None = None
+        self._uploads = 0
+        self._readers: Counter[str] = Counter()  # of results, which stay until they are read
+        self._tasks: list[asyncio.Task[None]] = []
+        self._changed = asyncio.Condition()
+
+    async def __aenter__(self) -> Self:
+        jobs = await asyncio.to_thread(self._store.load)
+        self._jobs = {job.job_id: job for job in jobs}
+        return self
+
+    async def __aexit__(self, *exc_info: object) -> None:
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    def start(self) -> None:
+        """Run what waits, that of earlier servers first."""
+        self._tasks = [
+            asyncio.create_task(self._run_all(), name="sequences"),
+            asyncio.create_task(self._expire_now_and_then(), name="expire results"),
+        ]
+
+    @asynccontextmanager
+    async def place(self) -> AsyncIterator[Path]:
+        """A place in the queue, and a folder to receive an upload in, removed if not accepted.
+
+        Raises QueueFull.
+        """
+        if self._waiting_count() + self._uploads >= self._limits.waiting:
+            raise QueueFull(
+                f"{self._limits.waiting} sequences are waiting, as many as may; try again later",
+                retry_after_s=self._usual_job_s(),
+            )
+        self._uploads += 1
+        try:
+            folder = await asyncio.to_thread(self._store.new_folder)
+            try:
+                yield folder
+            finally:
+                await asyncio.to_thread(remove_folder, folder)
+        finally:
+            self._uploads -= 1
+
+    async def accept(self, folder: Path, wanted: str | None, options: JobOptions) -> JobStatus:
+        """Take the sequence below ``folder``/input; from the return on it will not be lost.
+
+        ``wanted`` is KIND:PATH, and needed where there are several. Raises BadSequence, QueueFull,
+        UploadTooLarge, and what DepthEngine.open_apart raises.
+        """
+        spec, source = await asyncio.to_thread(_find, folder / "input", wanted)
+        await self._engine.open_apart(opening_of(source.rig, options))  # for its refusals
+        uploaded = await asyncio.to_thread(folder_bytes, folder)
+        job = Job(
+            job_id=secrets.token_hex(8),
+            source=spec,
+            frames=len(source),
+            source_fps=source.fps,
+            created_s=time.time(),
+            options=options,
+            disk_bytes=uploaded + _result_bytes(source, options),
+        )
+        await self._make_room(job.disk_bytes)
+        await asyncio.to_thread(self._store.accept, folder, job)
+        self._jobs[job.job_id] = job
+        await self._tell()
+        return self.status(job.job_id)
+
+    def status(self, job_id: str) -> JobStatus:
+        """Raises UnknownSequence."""
+        job = self._get(job_id)
+        if job.ended or self._running is None or self._running[0] != job_id:
+            done = job.frames if job.state is JobState.DONE else 0
+            ahead = 0 if job.ended else self._ahead(job)
+            return JobStatus(job, done, ahead, job.fps, None)
+        running = self._running[1]
+        fps = running.frames_done / max(time.monotonic() - running.since_s, 1e-6)
+        left = job.frames - running.frames_done
+        return JobStatus(job, running.frames_done, 0, fps or None, left / fps if fps else None)
+
+    def statuses(self) -> list[JobStatus]:
+        """Of all jobs, oldest first."""
+        return [self.status(job_id) for job_id in self._jobs]
+
+    async def change(self, *, within_s: float) -> None:
+        """Wait until a job begins, ends or is deleted, but not for longer than ``within_s``."""
+        async with self._changed:
+            try:
+                await asyncio.wait_for(self._changed.wait(), within_s)
+            except TimeoutError:
+                return
+
+    async def delete(self, job_id: str) -> None:
+        """Stop the job if it has not ended, and remove all that it has. Raises UnknownSequence."""
+        self._get(job_id)
+        del self._jobs[job_id]
+        if self._running is not None and self._running[0] == job_id:
+            task = self._running[1].task
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+        await asyncio.to_thread(self._store.delete, job_id)
+        await self._tell()
+
+    def result(self, job_id: str) -> tuple[Job, Path]:
+        """A job that is done, and the folder of its result.
+
+        Raises UnknownSequence, SequenceNotDone.
+        """
+        job = self._get(job_id)
+        if job.state is not JobState.DONE:
+            failure = f": {job.reason}: {job.message}" if job.state is JobState.FAILED else ""
+            raise SequenceNotDone(
+                f"sequence {job_id} has no result, it is {job.state}{failure}",
+                retry_after_s=None if job.ended else self._usual_job_s(),
+            )
+        return job, self._store.folder(job_id) / "result"
+
+    @contextmanager
+    def reading(self, job_id: str) -> Iterator[None]:
+        """The job's result does not expire before the block ends."""
+        self._readers[job_id] += 1
+        try:
+            yield
+        finally:
+            self._readers[job_id] -= 1
+
+    async def _run_all(self) -> None:
+        while True:
+            job = next((job for job in self._jobs.values() if not job.ended), None)
+            if job is None:
+                await self.change(within_s=_EXPIRE_EVERY_S)
+                continue
+            task = asyncio.create_task(self._run(job), name=f"sequence {job.job_id}")
+            self._running = job.job_id, _Running(time.monotonic(), task)
+            try:
+                await asyncio.wait([task])
+            finally:
+                task.cancel()
+                await asyncio.gather(task, return_exceptions=True)
+                self._running = None
+            if not task.cancelled() and task.exception():
+                return  # the server is shutting down
+
+    async def _run(self, job: Job) -> None:
+        if job.attempts >= _MAX_ATTEMPTS:
+            died = ModelFailed(f"the server died {job.attempts} times while it ran this sequence")
+            await self._end(_failed(job, died))
+            return
+        started = replace(job, state=JobState.RUNNING, attempts=job.attempts + 1)
+        await self._publish(started)
+        folder = self._store.folder(job.job_id)
+        try:
+            found = await run_job(self._engine, folder, started, self._count_frame)
+        except (Draining, NotReady, asyncio.CancelledError):
+            # Not the sequence's doing: it keeps its place, for this server or the next one.
+            if job.job_id in self._jobs:
+                await self._publish(replace(job, state=JobState.QUEUED))
+            raise
+        except DepthError as error:
+            await self._end(_failed(started, error))
+        except Exception:
+            log.exception("sequence %s failed in a way that nobody foresaw", job.job_id)
+            await self._end(_failed(started, ModelFailed("the server failed; its log says why")))
+        else:
+            await self._end(
+                replace(
+                    started,
+                    state=JobState.DONE,
+                    fps=self.status(job.job_id).fps,
+                    accuracy=None if found is None else asdict(found),
+                )
+            )
+
+    async def _end(self, job: Job) -> None:
+        """The job has ended: its input goes, its result counts from now on."""
+        folder = self._store.folder(job.job_id)
+        await asyncio.to_thread(remove_folder, folder / "input")
+        if job.state is JobState.FAILED:
+            await asyncio.to_thread(remove_folder, folder / "result")
+        taken = await asyncio.to_thread(folder_bytes, folder)
+        await self._publish(replace(job, finished_s=time.time(), disk_bytes=taken))
+
+    async def _publish(self, job: Job) -> None:
+        await asyncio.to_thread(self._store.update, job)
+        if job.job_id in self._jobs:
+            self._jobs[job.job_id] = job
+            await self._tell()
+
+    async def _tell(self) -> None:
+        async with self._changed:
+            self._changed.notify_all()
+
+    def _count_frame(self) -> None:
+        if self._running is not None:
+            self._running[1].frames_done += 1
+
+    async def _expire_now_and_then(self) -> None:
+        while True:
+            await self._expire(time.time() - self._limits.keep_s)
+            await asyncio.sleep(_EXPIRE_EVERY_S)
+
+    async def _expire(self, before_s: float) -> None:
+        for job in list(self._jobs.values()):
+            if job.finished_s is not None and job.finished_s < before_s and self._unread(job):
+                await self.delete(job.job_id)
+
+    async def _make_room(self, needed_bytes: int) -> None:
+        """Let the oldest results go until a new job fits. Raises QueueFull, UploadTooLarge."""
+        if needed_bytes > self._limits.disk_bytes:
+            raise UploadTooLarge(
+                f"the sequence and its result take {needed_bytes} bytes, the server keeps "
+                f"{self._limits.disk_bytes} for all; send it in parts"
+            )
+        for job in sorted(self._jobs.values(), key=lambda job: job.finished_s or 0):
+            if self._taken_bytes() + needed_bytes <= self._limits.disk_bytes:
+                return
+            if job.ended and self._unread(job):
+                await self.delete(job.job_id)
+        if self._taken_bytes() + needed_bytes > self._limits.disk_bytes:
+            raise QueueFull(
+                f"the sequences that wait take {self._taken_bytes()} of "
+                f"{self._limits.disk_bytes} bytes on disk, this one needs {needed_bytes}; try "
+                "again later",
+                retry_after_s=self._usual_job_s(),
+            )
+
+    def _get(self, job_id: str) -> Job:
+        if job_id not in self._jobs:
+            raise UnknownSequence(
+                f"no sequence {job_id[:64]!r}: it never was, was deleted, or its result expired, "
+                f"{self._limits.keep_s / 3600:g} h after its end or when disk space ran short"
+            )
+        return self._jobs[job_id]
+
+    def _ahead(self, job: Job) -> int:
+        unfinished = [each.job_id for each in self._jobs.values() if not each.ended]
+        return unfinished.index(job.job_id)
+
+    def _waiting_count(self) -> int:
+        return sum(not job.ended for job in self._jobs.values())
+
+    def _unread(self, job: Job) -> bool:
+        return self._readers[job.job_id] == 0
+
+    def _taken_bytes(self) -> int:
+        return sum(job.disk_bytes for job in self._jobs.values())
+
+    def _usual_job_s(self) -> float:
+        """How long until a place is free, as far as anybody can tell."""
+        if self._running is not None:
+            eta_s = self.status(self._running[0]).eta_s
+            if eta_s is not None:
+                return max(eta_s, 1.0)
+        return _USUAL_JOB_S
+
+
+def _find(folder: Path, wanted: str | None) -> tuple[str, StereoSource]:
+    spec = find_sequence(folder, wanted)
+    return spec, open_below(folder, spec)
+
+
+def _result_bytes(source: StereoSource, options: JobOptions) -> int:
+    pixels = source.rig.left.width * source.rig.left.height
+    return len(source) * pixels * (5 if Output.CONFIDENCE in options.outputs else 4)
+
+
+def _failed(job: Job, error: DepthError) -> Job:
+    return replace(job, state=JobState.FAILED, reason=error.code, message=str(error))

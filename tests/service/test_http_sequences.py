@@ -1,0 +1,269 @@
+"""Whole sequences over HTTP: what comes back is what a live stream of the same frames gets."""
+
+import asyncio
+import io
+import json
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import cv2
+import httpx
+import numpy as np
+import pytest
+
+from tests.support.frames import RIG, frame_message
+from tests.support.http import (
+    ZIP,
+    disparities,
+    disparities_in,
+    ended,
+    files_below,
+    http_server,
+    http_to,
+    reason_of,
+    submit,
+)
+from tests.support.models import NOT_FINITE, RecallModel
+from tests.support.sequences import (
+    CALIBRATION,
+    make_frames,
+    png,
+    pose_numbers,
+    sequence_files,
+    tar_bytes,
+    zip_bytes,
+)
+from tests.support.server import raw_stream, running_server
+from vergence_proto import codec
+from vergence_proto.errors import ErrorCode
+from vergence_proto.layouts import read_disparity_png, read_pfm
+from vergence_proto.types import Plane
+from vergence_service.model import Step, StepResult
+from vergence_service.transports.http_errors import HTTP_STATUS
+
+FRAMES = make_frames(6)
+ARCHIVE = zip_bytes(sequence_files(FRAMES))
+
+
+def test_every_error_code_has_an_http_status() -> None:
+    assert set(HTTP_STATUS) == set(ErrorCode)
+
+
+def form_files() -> list[tuple[str, bytes]]:
+    sequence = {"calibration": CALIBRATION, "poses": [pose_numbers(frame) for frame in FRAMES]}
+    return [
+        ("sequence", json.dumps(sequence).encode()),
+        *(("left", png(frame.left)) for frame in FRAMES),
+        *(("right", png(frame.right)) for frame in FRAMES),
+    ]
+
+
+UPLOADS: dict[str, dict[str, Any]] = {
+    "zip": {"content": ARCHIVE, "headers": ZIP},
+    "zip in a folder": {
+        "content": zip_bytes((f"room/{name}", file) for name, file in sequence_files(FRAMES)),
+        "headers": ZIP,
+    },
+    "tar": {
+        "content": tar_bytes(sequence_files(FRAMES), "w"),
+        "headers": {"Content-Type": "application/x-tar"},
+    },
+    "tar.gz": {
+        "content": tar_bytes(sequence_files(FRAMES), "w:gz"),
+        "headers": {"Content-Type": "application/gzip"},
+    },
+    "tar.xz as bytes": {
+        "content": tar_bytes(sequence_files(FRAMES), "w:xz"),
+        "headers": {"Content-Type": "application/octet-stream"},
+    },
+    "archive in a form": {"files": {"archive": ARCHIVE}},
+    "frames in a form": {"files": form_files()},
+}
+
+
+async def test_a_sequence_gets_what_its_frames_get_over_grpc_however_it_is_packed() -> None:
+    async with running_server(RecallModel()) as server, http_to(server) as client:
+        async with raw_stream(server) as call:
+            answers = [(await call.ask(frame_message(frame))).disparity for frame in FRAMES]
+            streamed = [codec.disparity_from_proto(each, RIG).disparity_px for each in answers]
+        for packed, upload in UPLOADS.items():
+            query: dict[str, str | bool] = {"wait": True, "format": "npz"}
+            answer = await client.post("/v1/sequences", params=query, **upload)
+            assert answer.status_code == 200, (packed, answer.text)
+            np.testing.assert_array_equal(disparities_in(answer.content), streamed, packed)
+
+
+async def test_a_job_tells_how_far_it_is_and_ends_with_its_result() -> None:
+    model = RecallModel()
+    async with http_server(model) as client:
+        with model.busy():
+            job = await submit(client, ARCHIVE)
+            assert (job["frames"], job["source"]) == (6, "vergence:")
+            async with client.stream("GET", f"/v1/sequences/{job['id']}/events") as events:
+                told = []
+                async for line in events.aiter_lines():
+                    if line.startswith("data: "):
+                        told.append(json.loads(line.removeprefix("data: ")))
+                        model.let_go()
+        done = await ended(client, job["id"])
+        listed = (await client.get("/v1/sequences")).json()
+    assert told[0]["state"] in ("queued", "running")
+    assert told[-1] == done
+    assert (done["state"], done["frames_done"]) == ("done", 6)
+    assert listed == [done]
+
+
+async def test_results_come_in_every_format_and_output() -> None:
+    async with http_server(RecallModel()) as client:
+        job = await submit(client, ARCHIVE, output=["disparity", "depth", "confidence"])
+        await ended(client, job["id"])
+        exact = await disparities(client, job["id"])
+        zips = {
+            form: await client.get(f"/v1/sequences/{job['id']}/result", params={"format": form})
+            for form in ("png16", "pfm", "npz", "mp4")
+        }
+    depths = [RIG.depth_from_disparity(each) for each in exact]
+    for form, extension in (("png16", "png"), ("pfm", "pfm")):
+        with zipfile.ZipFile(io.BytesIO(zips[form].content)) as file:
+            assert file.testzip() is None
+            assert json.loads(file.read("rig.json"))["baseline_m"] == RIG.baseline_m
+            for name, planes in (("disparity", exact), ("depth", depths)):
+                for index, plane in enumerate(planes):
+                    content = file.read(f"{name}/{index:06d}.{extension}")
+                    np.testing.assert_allclose(
+                        read_back(content, extension), plane, atol=0 if form == "pfm" else 1 / 512
+                    )
+            confidence = np.frombuffer(file.read("confidence/000005.png"), np.uint8)
+            assert np.asarray(cv2.imdecode(confidence, cv2.IMREAD_UNCHANGED)).dtype == np.uint8
+    with zipfile.ZipFile(io.BytesIO(zips["npz"].content)) as file:
+        arrays = np.load(io.BytesIO(file.read("000000.npz")))
+        np.testing.assert_array_equal(arrays["depth"], depths[0])
+        assert set(arrays) == {"disparity", "depth", "confidence"}
+    assert zips["mp4"].headers["Content-Type"] == "video/mp4"
+    assert zips["mp4"].content[4:8] == b"ftyp"
+
+
+def read_back(content: bytes, extension: str) -> Plane:
+    with TemporaryDirectory() as scratch:
+        path = Path(scratch) / f"plane.{extension}"
+        path.write_bytes(content)
+        return read_disparity_png(path) if extension == "png" else read_pfm(path)
+
+
+async def test_accuracy_is_told_where_the_archive_has_the_truth() -> None:
+    async with http_server(RecallModel()) as client:
+        asked = await submit(client, ARCHIVE, metrics=True)
+        unasked = await submit(client, ARCHIVE)
+        accuracy = (await ended(client, asked["id"]))["accuracy"]
+        maps = await disparities(client, asked["id"])
+        assert (await ended(client, unasked["id"]))["accuracy"] is None
+    assert accuracy["epe_px"] == pytest.approx(np.mean([np.abs(each - 8) for each in maps]))
+    assert accuracy["n"] == 6 * RIG.width * RIG.height
+
+
+async def test_iterations_are_those_asked_for() -> None:
+    frames = FRAMES[:2]
+    async with http_server(IterationsModel()) as client:
+        job = await submit(client, zip_bytes(sequence_files(frames)), iterations=4)
+        await ended(client, job["id"])
+        assert [float(each[0, 0]) for each in await disparities(client, job["id"])] == [4, 4]
+        job = await submit(client, zip_bytes(sequence_files(frames)))
+        await ended(client, job["id"])
+        assert [float(each[0, 0]) for each in await disparities(client, job["id"])] == [4, 1]
+
+
+class IterationsModel(RecallModel):
+    """Its disparity is the number of iterations."""
+
+    def step(self, steps: Sequence[Step]) -> list[StepResult]:
+        results = super().step(steps)
+        for row, result in zip(steps, results, strict=True):
+            result.offset_px[:] = row.iterations
+        return results
+
+
+async def test_a_deleted_job_stops_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    model = RecallModel()
+    async with http_server(model, batch__directory=tmp_path) as client:
+        with model.busy():
+            running = await submit(client, ARCHIVE)
+            waiting = await submit(client, ARCHIVE)
+            await asyncio.to_thread(model.wait_until_entered)
+            assert waiting["ahead"] == 1
+            for job in (running, waiting):
+                assert (await client.delete(f"/v1/sequences/{job['id']}")).status_code == 204
+                answer = await client.get(f"/v1/sequences/{job['id']}")
+                assert (answer.status_code, reason_of(answer)) == (404, "SEQUENCE_UNKNOWN")
+        after = await submit(client, ARCHIVE)
+        assert (await ended(client, after["id"]))["state"] == "done"
+        assert (await client.delete(f"/v1/sequences/{after['id']}")).status_code == 204
+        assert not files_below(tmp_path / "jobs")
+
+
+async def test_a_sequence_that_fails_says_at_what_and_the_next_one_runs() -> None:
+    frames = make_frames(4)
+    frames[2].left[0, 0] = NOT_FINITE
+    async with http_server(RecallModel()) as client:
+        job = await submit(client, zip_bytes(sequence_files(frames)))
+        failed = await ended(client, job["id"])
+        assert (failed["state"], failed["reason"]) == ("failed", "NON_FINITE")
+        answer = await client.get(f"/v1/sequences/{job['id']}/result")
+        assert (answer.status_code, reason_of(answer)) == (409, "SEQUENCE_NOT_DONE")
+        assert "NON_FINITE" in answer.json()["detail"]
+        assert (await ended(client, (await submit(client, ARCHIVE))["id"]))["state"] == "done"
+
+
+async def test_a_result_before_its_time_says_so() -> None:
+    model = RecallModel()
+    async with http_server(model) as client:
+        with model.busy():
+            job = await submit(client, ARCHIVE)
+            answer = await client.get(f"/v1/sequences/{job['id']}/result")
+            assert (answer.status_code, reason_of(answer)) == (409, "SEQUENCE_NOT_DONE")
+
+
+async def test_a_full_queue_says_when_to_come_back_and_takes_the_next_one_then() -> None:
+    model = RecallModel()
+    async with http_server(model, batch__waiting=1) as client:
+        with model.busy():
+            job = await submit(client, ARCHIVE)
+            answer = await client.post("/v1/sequences", content=ARCHIVE, headers=ZIP)
+            assert (answer.status_code, reason_of(answer)) == (429, "QUEUE_FULL")
+            assert int(answer.headers["Retry-After"]) >= 1
+        await ended(client, job["id"])
+        await submit(client, ARCHIVE)
+
+
+async def test_a_pair_is_answered_at_once() -> None:
+    frame = FRAMES[0]
+    files = {"left": png(frame.left), "right": png(frame.right)}
+    async with running_server(RecallModel()) as server, http_to(server) as client:
+        async with raw_stream(server) as call:
+            streamed = (await call.ask(frame_message(frame))).disparity
+        exact = await client.post("/v1/pairs", params={"format": "npy"}, files=files)
+        rounded = await client.post("/v1/pairs", files=files)
+        query: dict[str, str | float] = {"format": "npy", "output": "depth"}
+        query |= {"fx_px": RIG.fx, "baseline_m": RIG.baseline_m}
+        depth = await client.post("/v1/pairs", params=query, files=files)
+    expected = codec.disparity_from_proto(streamed, RIG)
+    np.testing.assert_array_equal(np.load(io.BytesIO(exact.content)), expected.disparity_px)
+    np.testing.assert_array_equal(np.load(io.BytesIO(depth.content)), expected.depth_m)
+    assert rounded.headers["Content-Type"] == "image/png"
+    stored = cv2.imdecode(np.frombuffer(rounded.content, np.uint8), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(stored, np.rint(expected.disparity_px * 256))
+
+
+async def test_health_metrics_and_schema_answer() -> None:
+    async with http_server(RecallModel()) as client:
+        answers: dict[str, httpx.Response] = {
+            path: await client.get(path)
+            for path in ("/healthz", "/readyz", "/metrics", "/openapi.json")
+        }
+    assert {path: answer.status_code for path, answer in answers.items()} == dict.fromkeys(
+        answers, 200
+    )
+    assert "vergence_streams_open" in answers["/metrics"].text
+    assert "/v1/sequences" in answers["/openapi.json"].json()["paths"]

@@ -1,0 +1,76 @@
+"""HTTP to a server in this process, and what its answers hold."""
+
+import asyncio
+import io
+import zipfile
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+from numpy.typing import NDArray
+
+from tests.support.server import PATIENCE_S, running_server
+from vergence_service.app import Running
+from vergence_service.model import StereoModel
+
+ZIP = {"Content-Type": "application/zip"}
+
+
+@asynccontextmanager
+async def http_to(server: Running) -> AsyncIterator[httpx.AsyncClient]:
+    base = f"http://{server.http_address}"
+    async with httpx.AsyncClient(base_url=base, timeout=PATIENCE_S) as client:
+        yield client
+
+
+@asynccontextmanager
+async def http_server(model: StereoModel, **flags: Any) -> AsyncIterator[httpx.AsyncClient]:
+    async with running_server(model, **flags) as server, http_to(server) as client:
+        yield client
+
+
+async def submit(client: httpx.AsyncClient, archive: bytes, **query: Any) -> dict[str, Any]:
+    """The job of an upload that was accepted."""
+    answer = await client.post("/v1/sequences", params=query, content=archive, headers=ZIP)
+    assert answer.status_code == 202, answer.text
+    job: dict[str, Any] = answer.json()
+    return job
+
+
+async def ended(client: httpx.AsyncClient, job_id: str) -> dict[str, Any]:
+    """The job once it is done or failed."""
+    async with asyncio.timeout(PATIENCE_S):
+        while True:
+            job: dict[str, Any] = (await client.get(f"/v1/sequences/{job_id}")).json()
+            if job["state"] in ("done", "failed"):
+                return job
+            await asyncio.sleep(0.02)
+
+
+async def disparities(client: httpx.AsyncClient, job_id: str) -> list[NDArray[np.float32]]:
+    answer = await client.get(f"/v1/sequences/{job_id}/result", params={"format": "npz"})
+    assert answer.status_code == 200, answer.text
+    return disparities_in(answer.content)
+
+
+def disparities_in(archive: bytes) -> list[NDArray[np.float32]]:
+    """Of a result as a zip of npz, in order."""
+    with zipfile.ZipFile(io.BytesIO(archive)) as file:
+        names = sorted(name for name in file.namelist() if name.endswith(".npz"))
+        return [np.load(io.BytesIO(file.read(name)))["disparity"] for name in names]
+
+
+def reason_of(answer: httpx.Response) -> str:
+    """Of a refusal, which must be told as a problem."""
+    assert answer.headers["Content-Type"] == "application/problem+json", answer.text
+    problem = answer.json()
+    assert problem["status"] == answer.status_code
+    assert problem["detail"]
+    return str(problem["reason"])
+
+
+def files_below(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
