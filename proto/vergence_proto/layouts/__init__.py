@@ -1,4 +1,23 @@
-"""Readers of stereo data on disk: each gives a :class:`StereoSource` from ``KIND:PATH``."""
+"""Readers of stereo data on disk: each gives a :class:`StereoSource` from ``KIND:PATH``.
+
+=============  =================================  ==================================================
+kind           one source is                      it has
+=============  =================================  ==================================================
+``vergence``   a sequence or a pair               poses; dense or sparse truth
+``kitti``      ``ROOT/sequences/00``              poses, where ``ROOT/poses/00.txt`` is there
+``kitti2012``  ``ROOT/training/000046``, a pair   LiDAR truth
+``kitti2015``  ``ROOT/training/000046``, a pair   LiDAR truth
+``sceneflow``  ``ROOT/frames_finalpass/A/B/0000`` poses, truth; of other renderers with ``?fx=PX``
+``tartanair``  ``ENV/Easy/P001``                  poses, truth
+``euroc``      ``MH_01_easy``                     unrectified; poses; no truth
+``middlebury`` ``Motorcycle-perfect``, a pair     truth
+``eth3d``      ``two_view_training/SCENE``,       truth
+               a pair
+=============  =================================  ==================================================
+
+Whatever the layout's own conventions, what comes out has OpenCV camera axes, metres, nanoseconds,
+and truth as pixel offsets u_left - u_right. Each module states its layout.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
