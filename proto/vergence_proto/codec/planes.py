@@ -124,6 +124,7 @@ def _stored(message: pb.Plane) -> Stored:
     if message.encoding not in _WIRE_TYPES:
         raise BadImage(f"expected a plane encoding of depth.proto, got {message.encoding}")
     dtype = _WIRE_TYPES[message.encoding]
+    data = message.data  # every access copies
     shape = message.height, message.width
     size = message.height * message.width * dtype.itemsize
     if size == 0:
@@ -131,15 +132,15 @@ def _stored(message: pb.Plane) -> Stored:
     if message.compression == pb.COMPRESSION_DELTA_ZSTD:
         if dtype.kind != "u":
             raise BadImage("only UINT16 and UINT8 planes can be compressed")
-        return decompress_plane(message.data, size, shape, dtype)
+        return decompress_plane(data, size, shape, dtype)
     if message.compression not in (pb.COMPRESSION_NONE, pb.COMPRESSION_UNSPECIFIED):
         raise BadImage(f"expected a compression of depth.proto, got {message.compression}")
-    if len(message.data) != size:
+    if len(data) != size:
         raise BadImage(
             f"a {message.width}x{message.height} plane of {dtype.name} is {size} bytes, "
-            f"got {len(message.data)}"
+            f"got {len(data)}"
         )
-    plane: Stored = np.frombuffer(message.data, dtype).reshape(shape)
+    plane: Stored = np.frombuffer(data, dtype).reshape(shape)
     return plane
 
 
