@@ -24,7 +24,7 @@ from vergence_proto.codec.rigs import (
     pose_sample_to_proto,
     pose_to_proto,
 )
-from vergence_proto.errors import BadImage, BadShape, DepthError, error_from_wire
+from vergence_proto.errors import BadImage, BadShape, DepthError, FrameTooLarge, error_from_wire
 from vergence_proto.geometry import RectifiedRig
 from vergence_proto.types import (
     Delivery,
@@ -65,9 +65,14 @@ def frame_to_proto(
     return message
 
 
-def frame_from_proto(message: pb.Frame, *, size: tuple[int, int] | None = None) -> StereoFrame:
-    """Decode both images and the pose. ``size`` is the (width, height) that both must have.
+def frame_from_proto(
+    message: pb.Frame, *, size: tuple[int, int] | None = None, max_bytes: int | None = None
+) -> StereoFrame:
+    """Decode both images and the pose.
 
+    ``size`` is the (width, height) that both must have, ``max_bytes`` what they may take together.
+
+    Raises FrameTooLarge: more than ``max_bytes``.
     Raises BadShape: no frame id, another size than ``size`` or two sizes (no image is decoded
     then), or a maximum age that is no length of time.
     Raises BadImage, BadPose: as :func:`image_from_proto` and :func:`pose_sample_from_proto`.
@@ -87,11 +92,17 @@ def frame_from_proto(message: pb.Frame, *, size: tuple[int, int] | None = None) 
             f"expected images of {size[0]}x{size[1]}, as the stream was opened with, "
             f"got {left.width}x{left.height}"
         )
+    left_data, right_data = left.data, right.data  # once: every access copies
+    if max_bytes is not None and len(left_data) + len(right_data) > max_bytes:
+        raise FrameTooLarge(
+            f"expected a frame of at most {max_bytes} bytes, got {len(left_data)} and "
+            f"{len(right_data)}"
+        )
     return StereoFrame(
         frame_id=message.frame_id,
         capture_ns=message.capture_ns,
-        left=_side(left, "left"),
-        right=_side(right, "right"),
+        left=_side(left, left_data, "left"),
+        right=_side(right, right_data, "right"),
         pose=pose_sample_from_proto(message.pose) if message.HasField("pose") else None,
     )
 
@@ -229,9 +240,9 @@ def error_from_frame_error(message: pb.FrameError) -> DepthError:
     return error_from_wire(message.reason, message.message, retry_after_s)
 
 
-def _side(message: pb.Image, side: str) -> Image:
+def _side(message: pb.Image, data: bytes, side: str) -> Image:
     try:
-        return image_from_proto(message)
+        return image_from_proto(message, data)
     except BadImage as error:
         raise BadImage(f"{side} image: {error}") from None
 

@@ -65,27 +65,29 @@ def image_to_proto(
     return message
 
 
-def image_from_proto(message: pb.Image) -> Image:
-    """Decode to uint8 [H, W, 3] RGB; grey is repeated. May be a read-only view of the message.
+def image_from_proto(message: pb.Image, data: bytes | None = None) -> Image:
+    """Decode to uint8 [H, W, 3] RGB; grey is repeated. May be a read-only view of ``data``.
 
+    ``data`` is the message's own, from a caller that has looked at it: every access copies it.
     Raises BadImage: bytes that are not a whole image of the stated encoding and size.
     """
+    data = message.data if data is None else data
     stated = (message.width, message.height)
     if 0 in stated:
         raise BadImage(f"expected a size in pixels, got {message.width}x{message.height}")
     if message.encoding in _CHANNELS:
-        return _from_raw(message)
+        return _from_raw(message, data)
     if message.encoding == pb.IMAGE_ENCODING_JPEG:
-        name, size = "JPEG", _jpeg_size(message.data)
+        name, size = "JPEG", _jpeg_size(data)
     elif message.encoding == pb.IMAGE_ENCODING_PNG:
-        name, size = "PNG", _png_size(message.data)
+        name, size = "PNG", _png_size(data)
     else:
         raise BadImage(f"expected an image encoding of depth.proto, got {message.encoding}")
     if size != stated:
         raise BadImage(
             f"the message says {stated[0]}x{stated[1]}, its {name} is {size[0]}x{size[1]}"
         )
-    return decode_image(message.data)
+    return decode_image(data)
 
 
 def decode_image(data: bytes) -> Image:
@@ -108,10 +110,9 @@ def decode_image(data: bytes) -> Image:
     return np.asarray(cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB, dst=decoded), np.uint8)
 
 
-def _from_raw(message: pb.Image) -> Image:
+def _from_raw(message: pb.Image, data: bytes) -> Image:
     channels = _CHANNELS[message.encoding]
     expected = message.width * message.height * channels
-    data = message.data  # every access copies
     if len(data) != expected:
         raise BadImage(
             f"{message.width}x{message.height} with {channels} byte(s) a pixel is {expected} bytes "

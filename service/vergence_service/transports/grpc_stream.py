@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from vergence_proto import codec
-from vergence_proto.errors import BadShape, DepthError, FrameTooLarge, StreamExists, UnknownStream
+from vergence_proto.errors import BadShape, DepthError, StreamExists, UnknownStream
 from vergence_proto.types import DisparityMap
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.engine import DepthEngine
@@ -174,10 +174,6 @@ class DepthCall:
         self, stream: Stream, mailbox: Mailbox[pb.Frame], frame: pb.Frame, arrived_s: float
     ) -> None:
         try:
-            if (size := frame.ByteSize()) > self._limits.max_frame_bytes:
-                raise FrameTooLarge(
-                    f"expected a frame of at most {self._limits.max_frame_bytes} bytes, got {size}"
-                )
             displaced = await mailbox.put(Letter(frame.frame_id, frame, arrived_s))
         except DepthError as error:
             self._engine.count_failed(stream, error)
@@ -193,6 +189,7 @@ class DepthCall:
         await self._outbox.put(pb.StreamDepthResponse(frames_dropped=dropped))
 
     async def _step(self, stream: Stream, mailbox: Mailbox[pb.Frame]) -> None:
+        rig = stream.rectifier.rig
         while True:
             await self._unsent.acquire()
             letter = await mailbox.take()
@@ -204,7 +201,12 @@ class DepthCall:
                     await self._engine.reset(stream.stream_id)
                 disparity = await self._engine.step(
                     stream.stream_id,
-                    partial(codec.frame_from_proto, frame),
+                    partial(
+                        codec.frame_from_proto,
+                        frame,
+                        size=(rig.width, rig.height),
+                        max_bytes=self._limits.max_frame_bytes,
+                    ),
                     arrived_s=letter.arrived_s,
                     max_age_s=frame.max_age_s if frame.HasField("max_age_s") else None,
                 )
