@@ -15,7 +15,7 @@ from vergence_models.data.generator import ClipGenerator, GeneratorConfig
 from vergence_models.data.materials import Material
 from vergence_models.data.pool import ClipPool, write_shard
 from vergence_models.data.render import Shot, render
-from vergence_models.data.scenes import Builder, Light, Scene
+from vergence_models.data.scenes import Builder, Light, Scene, turn_y
 from vergence_models.data.sensor import SensorConfig, film_as_sensor
 from vergence_models.data.shapes import Cutout, Shape, intersect
 from vergence_models.data.textures import TextureBank
@@ -52,7 +52,6 @@ def still_life(build: Builder, *, poses: np.ndarray | None = None) -> Shot:
         sky_texture=0,
         sky_color=np.ones(3),
         exposure=0.4,
-        frame_m=4.0,
     )
     world_from_left = np.eye(4)[None] if poses is None else poses
     times_s = np.arange(len(world_from_left)) / 30
@@ -104,9 +103,10 @@ def test_disparity_of_a_ball_is_that_of_its_nearer_side(generator: ClipGenerator
 @pytest.mark.parametrize("shape", [Shape.QUAD, Shape.BOX, Shape.ELLIPSOID, Shape.CYLINDER])
 def test_hits_lie_on_the_surface_and_are_the_first(shape: Shape) -> None:
     rng = np.random.default_rng(shape.value)
-    origin = tuple(torch.full((1, 1), x) for x in (1.7, -2.1, 3.0))
+    start = torch.tensor([1.7, -2.1, 3.0])[:, None, None]
     aim = torch.from_numpy(rng.uniform(-1.2, 1.2, (3, 1, 4000)).astype(np.float32))
-    direction = tuple(aim[i] - origin[i] for i in range(3))
+    origin = (start[0], start[1], start[2])
+    direction = (aim[0] - start[0], aim[1] - start[1], aim[2] - start[2])
     taper = torch.full((1, 1), 0.4 if shape is Shape.CYLINDER else 0.0)
     full = torch.full((1, 1), float(Cutout.FULL))
     t = intersect(shape, origin, direction, taper=taper, cutout=full)
@@ -201,12 +201,8 @@ def furnished_room(bank: TextureBank) -> StereoClips:
     b.box((-0.6, 0.6, 2.2), (0.3, 0.6, 0.3), PAINT)
     b.ball((0.5, 0.2, 2.6), (0.4, 0.3, 0.4), PAINT)
     b.post((0.1, 0, 1.8), 0.1, 1.0, PAINT, taper=0.3)
-    angle = 0.03
-    turn = np.array(
-        [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
-    )
     step = np.eye(4)
-    step[:3, :3], step[:3, 3] = turn, (0.03, -0.02, 0.05)
+    step[:3, :3], step[:3, 3] = turn_y(0.03), (0.03, -0.02, 0.05)
     poses = np.stack([np.linalg.matrix_power(step, k) for k in range(4)])
     return render([still_life(b, poses=poses)], bank, width=128, height=96)
 

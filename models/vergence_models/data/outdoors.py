@@ -60,7 +60,7 @@ def street(rng: np.random.Generator, palette: Palette, view: Viewpoint) -> tuple
         Light(np.array([0, -30.0 * s, 0]), light_color(rng, 0.3), 1000 * s),
     )
     target = np.array([0, 0, 15.0 * s])
-    scene = compose(b, rng, palette, lights, target, 0.35, frame_m=60 * s, sky=True)
+    scene = compose(b, rng, palette, lights, target, 0.35, sky=True)
     return scene, float(camera_height)
 
 
@@ -81,4 +81,4 @@ def swarm(rng: np.random.Generator, palette: Palette, view: Viewpoint) -> tuple[
         Light(rng.normal(0, 0.5, 3) * far, light_color(rng, 0.6), 2 * far),
     )
     target = np.array([0, 0, far * 0.6])
-    return compose(b, rng, palette, lights, target, 0.8, frame_m=far, sky=True), 0.0
+    return compose(b, rng, palette, lights, target, 0.8, sky=True), 0.0

@@ -62,8 +62,7 @@ def room(rng: np.random.Generator, palette: Palette, view: Viewpoint) -> tuple[S
               light_color(rng, 0.6), 3 * s),
     )  # fmt: skip
     target = lamp + np.array([0.01, 1.0, 0.02])
-    reach = float(half.max())
-    scene = compose(b, rng, palette, lights, target, np.radians(68), frame_m=reach)
+    scene = compose(b, rng, palette, lights, target, np.radians(68))
     return scene, float(camera_height)
 
 
@@ -179,7 +178,7 @@ def clutter(rng: np.random.Generator, palette: Palette, view: Viewpoint) -> tupl
         Light(rng.normal(0, 1, 3) * far * (1, 0, 1) - (0, far, 0), light_color(rng, 0.5), 2 * far),
     )
     target = np.array([0.0, 0.0, far * 0.6])
-    return compose(b, rng, palette, lights, target, 0.9, frame_m=far), float(camera_height)
+    return compose(b, rng, palette, lights, target, 0.9), float(camera_height)
 
 
 def _sticks(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> None:

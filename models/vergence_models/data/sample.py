@@ -98,7 +98,6 @@ def living_room(kinds: tuple[str, ...]) -> Scene:
         sky_texture=palette.texture("clouds"),
         sky_color=np.array([0.9, 0.95, 1.0]),
         exposure=0.5,
-        frame_m=2.8,
     )
 
 

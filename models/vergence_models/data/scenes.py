@@ -40,7 +40,6 @@ class Scene:
     sky_texture: int
     sky_color: NDArray[np.float64]  # [3]
     exposure: float  # the mean brightness that the camera aims at, 0..1
-    frame_m: float  # the size of the surroundings, for reports and tests
 
 
 @dataclass(slots=True, eq=False)

@@ -72,7 +72,7 @@ def light_color(rng: np.random.Generator, strength: float) -> NDArray[np.float64
 
 def compose(
     b: Builder, rng: np.random.Generator, palette: Palette, lights: tuple[Light, Light],
-    target: NDArray[np.float64], half_angle: float, *, frame_m: float, sky: bool = False,
+    target: NDArray[np.float64], half_angle: float, *, sky: bool = False,
 ) -> Scene:  # fmt: skip
     return Scene(
         primitives=np.array(b.rows, np.float32),
@@ -83,5 +83,4 @@ def compose(
         sky_texture=palette.texture("photo", "clouds"),
         sky_color=np.array([0.9, 1.0, 1.15]) * (rng.uniform(0.8, 2.2) if sky else 0.8),
         exposure=float(rng.uniform(0.15, 0.6)),
-        frame_m=frame_m,
     )
