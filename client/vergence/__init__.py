@@ -7,12 +7,16 @@
     # One pair, one line.
     depth_m = vergence.depth(left, right, rig).depth_m
 
-    # A moving camera: frames and poses in, results as they come.
+    # A moving camera, live: one task films, another shows.
+    async def film(session):
+        async for left, right, world_from_left in camera:
+            session.submit(left, right, world_from_left)
+
     async with vergence.DepthClient("grpc://127.0.0.1:50051") as client:
         async with client.open_session(rig) as session:
-            session.submit(left, right, world_from_left)
+            filming = asyncio.create_task(film(session))
             async for result in session:
-                print(result.depth_m, result.age_s)
+                show(result.depth_m, result.age_s)
 
 Everything public is in ``__all__``; modules behind it may change. The errors are those of
 :mod:`vergence_proto.errors`, re-exported here.

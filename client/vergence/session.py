@@ -40,6 +40,9 @@ class DepthSession:
     when the method returns. A pose says where the left camera was at mid-exposure, camera to
     world, in the session's axes; a matrix is [3, 4] or [4, 4]. Without a pose nothing is warped.
 
+    Methods are for the event loop's own thread; a camera that calls back from another one hands
+    over by ``loop.call_soon_threadsafe(session.submit, left, right, world_from_left)``.
+
     A connection that breaks is made again and the stream resumed where it stood, for as long as
     the server keeps its state; ``on_event`` hears of it, and the next result's origin is RESUMED.
     """
