@@ -17,6 +17,7 @@ from vergence_proto.errors import (
     BadShape,
     DepthError,
     ErrorCode,
+    FrameTooLarge,
 )
 from vergence_proto.geometry import Axes, Pose, RectifiedRig
 from vergence_proto.types import (
@@ -96,6 +97,13 @@ class TestFrames:
         message.left.data = message.right.data = b"never looked at"
         with pytest.raises(BadShape, match=r"expected images of 640x480, .* got 8x6"):
             codec.frame_from_proto(message, size=(640, 480))
+
+    def test_a_frame_of_too_many_bytes_is_refused_without_decoding(self) -> None:
+        message = a_frame_message()
+        assert codec.frame_from_proto(message, max_bytes=2 * 144).left.shape == (6, 8, 3)
+        message.right.data += b"!"
+        with pytest.raises(FrameTooLarge, match="at most 288 bytes, got 144 and 145"):
+            codec.frame_from_proto(message, max_bytes=2 * 144)
 
     @pytest.mark.parametrize("side", ["left", "right"])
     def test_a_damaged_image_is_told_by_its_side(self, side: str) -> None:
