@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import grpc
@@ -220,6 +221,28 @@ async def test_a_call_opens_one_stream() -> None:
 async def test_a_message_without_content_ends_the_call() -> None:
     async with running_server(RecallModel()) as server, raw_stream(server) as call:
         assert await ends_with(call, pb.StreamDepthRequest()) == "BAD_SHAPE"
+
+
+@pytest.mark.parametrize("opened", [False, True], ids=["at-first", "later"])
+async def test_bytes_that_are_no_message_end_the_call_and_keep_the_stream(opened: bool) -> None:
+    async with (
+        running_server(RecallModel()) as server,
+        grpc.aio.insecure_channel(server.grpc_address) as channel,
+        connected(server) as stub,
+    ):
+        # Typed stubs cannot send what is no message, so this channel speaks bytes.
+        speak: Any = channel.stream_stream
+        call = speak("/vergence.v1.DepthService/StreamDepth")()
+        if opened:
+            await call.write(open_message("mine").SerializeToString())
+            await call.read()
+        await call.write(b"\xff\xff\xff nonsense")
+        with pytest.raises(grpc.aio.AioRpcError) as failure:
+            await asyncio.wait_for(call.read(), 10)
+        assert failure.value.code() is grpc.StatusCode.INVALID_ARGUMENT
+        assert reason_of(failure.value) == "BAD_SHAPE"
+        info = await stub.GetServerInfo(pb.GetServerInfoRequest())
+        assert info.streams_open == int(opened)
 
 
 async def test_a_message_far_over_the_limit_ends_the_call_and_keeps_the_stream() -> None:

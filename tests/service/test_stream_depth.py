@@ -9,8 +9,16 @@ from tests.support.frames import RIG, frame_message, make_frame
 from tests.support.models import RecallModel
 from tests.support.server import RawCall, connected, raw_stream, running_server
 from vergence_proto import codec
+from vergence_proto.geometry import RectifiedRig
+from vergence_proto.types import StereoRig
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_service.model import RecurrentState, Step, View
+from vergence_service.model import (
+    OnnxStereoModel,
+    RecurrentState,
+    Step,
+    View,
+    packaged_weights_dir,
+)
 
 END = pb.StreamDepthRequest(end=pb.End())
 RESET = pb.StreamDepthRequest(reset=pb.Reset())
@@ -110,6 +118,47 @@ async def test_a_lossless_stream_makes_the_sender_wait_and_loses_nothing() -> No
     maps = [answer.disparity for answer in answers if answer.HasField("disparity")]
     assert [answer.frame_id for answer in maps] == list(range(1, 41))
     assert {answer.frames_skipped for answer in maps} == {0}
+
+
+async def test_a_client_that_does_not_read_is_not_sent_what_is_old_by_then() -> None:
+    rig = RectifiedRig(640, 480, 500.0, 500.0, 319.5, 319.5, 239.5, 0.1)  # 1.2 MB a map
+    async with (
+        running_server(RecallModel()) as server,
+        raw_stream(server, every=False, rig=StereoRig.from_rectified(rig)) as call,
+    ):
+        for i in range(1, 31):
+            await call.send(frame_message(make_frame(i, rig=rig)))
+        await call.send(END)
+        answers = await answers_until_end(call)
+    maps = [answer.disparity.frame_id for answer in answers if answer.HasField("disparity")]
+    assert sorted(frame_ids_answered(answers)) == list(range(1, 31))
+    assert maps == sorted(maps)
+    assert maps[-1] == 30
+    # What the client's gRPC takes without being read, one map on its way, one in the making.
+    assert len(maps) < 10
+
+
+async def test_two_clients_at_once_get_what_each_gets_alone_from_the_weights_that_ship() -> None:
+    rig = RectifiedRig(256, 128, 200.0, 200.0, 127.5, 127.5, 63.5, 0.1)
+    opening = {"rig": StereoRig.from_rectified(rig)}
+
+    async def walk(call: RawCall, brightness: int) -> list[bytes]:
+        frames = (make_frame(i, brightness=brightness, rig=rig) for i in range(1, 6))
+        answers = [await call.ask(frame_message(frame)) for frame in frames]
+        return [answer.disparity.disparity.data for answer in answers]
+
+    model = OnnxStereoModel(
+        packaged_weights_dir(), "lite", providers=["cpu"], threads=2, allow_spinning=False
+    )
+    async with running_server(model, model__max_batch=4) as server:
+        async with raw_stream(server, **opening) as one, raw_stream(server, **opening) as other:
+            together = await asyncio.gather(walk(one, 20), walk(other, 160))
+        alone = []
+        for brightness in (20, 160):
+            async with raw_stream(server, **opening) as call:
+                alone.append(await walk(call, brightness))
+    assert alone == list(together)
+    assert all(len(data) == 4 * rig.width * rig.height for walked in alone for data in walked)
 
 
 async def test_frames_after_a_reset_start_from_nothing() -> None:

@@ -4,9 +4,11 @@ from collections.abc import AsyncIterator
 from typing import Self
 
 import grpc
+from google.protobuf.message import DecodeError
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
+from vergence_proto.errors import BadShape
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.v1 import depth_pb2_grpc
 from vergence_service.transports import PortTaken
@@ -29,6 +31,16 @@ _KEEPALIVE = (
 )
 
 
+async def _messages(
+    requests: AsyncIterator[pb.StreamDepthRequest],
+) -> AsyncIterator[pb.StreamDepthRequest]:
+    try:
+        async for request in requests:
+            yield request
+    except DecodeError:
+        raise BadShape("expected messages of vergence.v1, got bytes that are none") from None
+
+
 class DepthServicer(depth_pb2_grpc.DepthServiceServicer):
     """Translates each call to the engine's words."""
 
@@ -40,7 +52,8 @@ class DepthServicer(depth_pb2_grpc.DepthServiceServicer):
         self, request_iterator: AsyncIterator[pb.StreamDepthRequest], context: Context
     ) -> None:
         async with errors_as_status(context):
-            await self.calls.run(self.calls.make(request_iterator, context.write))
+            requests = _messages(request_iterator)
+            await self.calls.run(self.calls.make(requests, context.write))
 
     async def GetServerInfo(  # noqa: N802
         self, request: pb.GetServerInfoRequest, context: Context

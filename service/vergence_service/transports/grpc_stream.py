@@ -167,6 +167,8 @@ class DepthCall:
                         self.end(StreamExists("this call has opened its stream already"))
                     case None:
                         self.end(BadShape("expected one of the messages of depth.proto, got none"))
+        except DepthError as error:  # what came is no message
+            self.end(error)
         finally:
             await mailbox.finish()
 
