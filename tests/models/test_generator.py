@@ -14,11 +14,13 @@ from vergence_models.data.clips import StereoClips
 from vergence_models.data.generator import ClipGenerator, GeneratorConfig
 from vergence_models.data.materials import Material
 from vergence_models.data.pool import ClipPool, write_shard
-from vergence_models.data.render import Shot, render
+from vergence_models.data.render import render
 from vergence_models.data.scenes import Builder, Light, Scene, turn_y
 from vergence_models.data.sensor import SensorConfig, film_as_sensor
 from vergence_models.data.shapes import Cutout, Shape, intersect
 from vergence_models.data.textures import TextureBank
+from vergence_models.data.truth import surface_truth
+from vergence_models.data.views import Shot
 
 SMALL = GeneratorConfig(width=128, height=96, frames=3, texture_size=64)
 FOCAL_PX, BASELINE_M = 100.0, 0.12
@@ -193,7 +195,7 @@ def agreement(clips: StereoClips, index: int) -> float:
     return right / max(total, 1)
 
 
-def furnished_room(bank: TextureBank) -> StereoClips:
+def furnished_shot() -> Shot:
     """A still scene with a box, a ball and a post, and a camera that moves and turns."""
     b = Builder()
     b.wall((0, 0, 4), 20, 20, PAINT)
@@ -204,7 +206,11 @@ def furnished_room(bank: TextureBank) -> StereoClips:
     step = np.eye(4)
     step[:3, :3], step[:3, 3] = turn_y(0.03), (0.03, -0.02, 0.05)
     poses = np.stack([np.linalg.matrix_power(step, k) for k in range(4)])
-    return render([still_life(b, poses=poses)], bank, width=128, height=96)
+    return still_life(b, poses=poses)
+
+
+def furnished_room(bank: TextureBank) -> StereoClips:
+    return render([furnished_shot()], bank, width=128, height=96)
 
 
 def test_pose_and_disparity_predict_the_next_frames_disparity(generator: ClipGenerator) -> None:
@@ -213,6 +219,37 @@ def test_pose_and_disparity_predict_the_next_frames_disparity(generator: ClipGen
     still = torch.eye(4, dtype=torch.float64).expand(1, 4, 4, 4)
     fields = {name: getattr(clips, name) for name in StereoClips.__slots__}
     assert agreement(StereoClips(**{**fields, "world_from_left": still}), 0) < 0.8
+
+
+def test_flow_of_a_still_scene_is_that_of_pose_and_disparity(generator: ClipGenerator) -> None:
+    shot = furnished_shot()
+    clips = render([shot], generator.bank, width=128, height=96)
+    truth = surface_truth([shot], width=128, height=96)
+    v, u = torch.meshgrid(torch.arange(96.0), torch.arange(128.0), indexing="ij")
+    for frame in range(3):
+        next_u, next_v, disparity = reprojected(clips, 0, frame)
+        expected = torch.stack([next_u - u, next_v - v, disparity])
+        found = torch.cat([truth.flow_px[0, frame], truth.next_disparity_px[0, frame][None]])
+        assert (found - expected).abs().max() < 5e-3  # px: float32 through two matrices
+
+
+def test_a_travelling_ball_takes_its_pixels_along() -> None:
+    b = Builder()
+    center, velocity = np.array([0.0, 0.0, 2.0]), np.array([0.9, -0.6, 0.3])
+    b.moving(velocity).ball(center, (0.5,) * 3, PAINT)
+    truth = surface_truth([still_life(b, poses=np.stack([np.eye(4)] * 2))], width=128, height=96)
+    x, y = pixel_rays()
+    middle = (48, 64)
+    ray = np.array([x[middle], y[middle], 1.0])
+    along = ray @ center / (ray @ ray)
+    reach = np.sqrt((0.25 - ((ray * along - center) ** 2).sum()) / (ray @ ray))
+    here = ray * (along - reach)
+    there = here + velocity / 30
+    expected = FOCAL_PX * (there[:2] / there[2] - here[:2] / here[2])
+    np.testing.assert_allclose(truth.flow_px[0, 0, :, 48, 64].numpy(), expected, atol=1e-3)
+    outward = (here - center) / 0.5
+    np.testing.assert_allclose(truth.normals[0, 0, :, 48, 64].numpy(), outward, atol=1e-3)
+    assert truth.flow_px[0, 0, :, 0, 0].isnan().all()
 
 
 def test_a_clip_is_the_same_alone_and_in_company(

@@ -13,6 +13,8 @@ from vergence_models.data.clips import StereoClips
 from vergence_models.data.render import render
 from vergence_models.data.shots import draw_shot
 from vergence_models.data.textures import TextureBank
+from vergence_models.data.truth import SurfaceTruth, surface_truth
+from vergence_models.data.views import Shot
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +46,18 @@ class ClipGenerator:
     def clips(self, *, seed: int, indices: Sequence[int]) -> StereoClips:
         """Clean clips number `indices` of the endless series that belongs to a seed."""
         c = self.config
-        shots = [
+        shots = self._shots(seed, indices)
+        return render(shots, self.bank, width=c.width, height=c.height, device=self.device)
+
+    def truth(self, *, seed: int, indices: Sequence[int]) -> SurfaceTruth:
+        """Normals, flow and the change of disparity for the same clips."""
+        c = self.config
+        shots = self._shots(seed, indices)
+        return surface_truth(shots, width=c.width, height=c.height, device=self.device)
+
+    def _shots(self, seed: int, indices: Sequence[int]) -> list[Shot]:
+        c = self.config
+        return [
             draw_shot(
                 np.random.default_rng((seed, index)),
                 self.bank.kinds,
@@ -55,4 +68,3 @@ class ClipGenerator:
             )
             for index in indices
         ]
-        return render(shots, self.bank, width=c.width, height=c.height, device=self.device)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -12,11 +12,10 @@ from torch import Tensor
 from vergence_models.data import scenes
 from vergence_models.data.clips import StereoClips
 from vergence_models.data.raycast import Cameras, Hits, Primitives, cast, intersect_rays
-from vergence_models.data.scenes import Scene
 from vergence_models.data.shading import FACES, Illumination, shade
 from vergence_models.data.shapes import Shape
 from vergence_models.data.textures import TextureBank
-from vergence_models.data.trajectories import rotation
+from vergence_models.data.views import Shot, both_eyes, column, in_views, padded_rows
 
 _SHADOW_RESOLUTION = 256
 # Four samples of an edge pixel, on a rotated grid: nearly vertical and horizontal edges both get
@@ -26,19 +25,6 @@ _GAMMA = 1 / 2.2
 _BRIGHTEST = 2.0  # a highlight brighter than this would swallow the edge it is on
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Shot:
-    """A scene and the rectified stereo camera that films it for T frames."""
-
-    scene: Scene
-    world_from_left: NDArray[np.float64]  # [T, 4, 4]
-    times_s: NDArray[np.float64]  # [T]
-    focal_px: float
-    cx: float
-    cy: float
-    baseline_m: float
-
-
 def render(
     shots: list[Shot], bank: TextureBank, *, width: int, height: int,
     device: torch.device | str = "cpu",
@@ -46,13 +32,13 @@ def render(
     """Film shots of one length into one batch of clean clips on a device."""
     count, frames = len(shots), len(shots[0].times_s)
     world_from_left = torch.from_numpy(np.stack([s.world_from_left for s in shots])).to(device)
-    baseline = _column([s.baseline_m for s in shots], device)
-    world_from_view = _both_eyes(world_from_left, baseline.double())  # [B, T, 2, 4, 4]
-    rows = _padded_rows(shots, device)
-    primitives, table = _in_views(rows, shots, world_from_view)
+    baseline = column([s.baseline_m for s in shots], device)
+    world_from_view = both_eyes(world_from_left, baseline.double())  # [B, T, 2, 4, 4]
+    rows = padded_rows(shots, device)
+    primitives, table = in_views(rows, shots, world_from_view)
 
     def per_view(values: list[float]) -> Tensor:
-        return _column(values, device).repeat_interleave(frames * 2)
+        return column(values, device).repeat_interleave(frames * 2)
 
     focal = per_view([s.focal_px for s in shots])
     cx, cy = per_view([s.cx for s in shots]), per_view([s.cy for s in shots])
@@ -75,73 +61,10 @@ def render(
         world_from_left=world_from_left,
         fx=first,
         fy=first.clone(),
-        cx=_column([s.cx for s in shots], device),
-        cy=_column([s.cy for s in shots], device),
+        cx=column([s.cx for s in shots], device),
+        cy=column([s.cy for s in shots], device),
         baseline_m=baseline,
     )
-
-
-def _column(values: list[float], device: torch.device | str) -> Tensor:
-    return torch.tensor(values, dtype=torch.float32, device=device)
-
-
-def _both_eyes(world_from_left: Tensor, baseline_m: Tensor) -> Tensor:
-    left_from_right = torch.eye(4, dtype=torch.float64, device=baseline_m.device)
-    left_from_right = left_from_right.repeat(len(baseline_m), 1, 1, 1)
-    left_from_right[:, 0, 0, 3] = baseline_m
-    return torch.stack([world_from_left, world_from_left @ left_from_right], dim=2)
-
-
-def _padded_rows(shots: list[Shot], device: torch.device | str) -> Tensor:
-    """All scenes as float64 [B, P, COLUMNS], filled up with primitives that nothing hits."""
-    longest = max(len(s.scene.primitives) for s in shots)
-    padded = np.zeros((len(shots), longest, scenes.COLUMNS))
-    padded[:, :, scenes.SHAPE] = Shape.PAD
-    padded[:, :, scenes.HALF_M] = 1
-    padded[:, :, scenes.ROTATION] = np.eye(3).ravel()
-    padded[:, :, scenes.MATERIAL.start + 1] = 1  # span_m is divided by
-    for row, shot in zip(padded, shots, strict=True):
-        row[: len(shot.scene.primitives)] = shot.scene.primitives
-    return torch.from_numpy(padded).to(device)
-
-
-def _in_views(
-    rows: Tensor, shots: list[Shot], world_from_view: Tensor
-) -> tuple[Primitives, Tensor]:
-    """The primitives in the axes of every view, and the table that shading reads, [C, M]."""
-    count, per_view = rows.shape[:2]
-    frames = world_from_view.shape[1]
-    times = torch.from_numpy(np.stack([s.times_s for s in shots])).to(rows.device)
-    center = rows[:, None, :, scenes.CENTER_M] + (
-        times[:, :, None, None] * rows[:, None, :, scenes.VELOCITY_M_S]
-    )
-    turned = rotation((times[:, :, None, None] * rows[:, None, :, scenes.SPIN_RAD_S]).cpu().numpy())
-    start = rows[:, None, :, scenes.ROTATION].reshape(count, 1, per_view, 3, 3)
-    world_from_local = torch.from_numpy(turned).to(rows.device) @ start  # [B, T, P, 3, 3]
-
-    view_from_world = world_from_view.inverse()[:, :, :, None]
-    turn = view_from_world[..., :3, :3] @ world_from_local[:, :, None]
-    shift = view_from_world[..., :3, :3] @ center[:, :, None, :, :, None]
-    shift = shift + view_from_world[..., :3, 3:]
-    half = rows[:, None, None, :, scenes.HALF_M].expand(-1, frames, 2, -1, -1)
-
-    def flat(values: Tensor) -> Tensor:
-        spread = values[:, None, None].expand(-1, frames, 2, *values.shape[1:])
-        return spread.reshape(-1, *values.shape[2:]).float()
-
-    inverse = turn.transpose(-1, -2) / half[..., None]
-    local_from_view = torch.cat([inverse, -inverse @ shift], -1).reshape(-1, 12).t().float()
-    primitives = Primitives(
-        shape=flat(rows[:, :, scenes.SHAPE]).long(),
-        local_from_view=local_from_view.contiguous(),
-        view_from_local=torch.cat([turn * half[..., None, :], shift], -1).view(-1, 3, 4).float(),
-        taper=flat(rows[:, :, scenes.TAPER]),
-        cutout=flat(rows[:, :, scenes.CUTOUT]),
-        views=count * frames * 2,
-    )
-    listed = [scenes.HALF_M, slice(scenes.SHAPE, scenes.SHAPE + 1), scenes.MATERIAL]
-    about = torch.cat([flat(rows[:, :, part]) for part in listed], dim=-1).t()
-    return primitives, torch.cat([local_from_view, about]).contiguous()
 
 
 def _illumination(
@@ -203,7 +126,7 @@ def _shadow_maps(rows: Tensor, shots: list[Shot]) -> tuple[Tensor, Tensor, list[
     still[..., scenes.SHAPE] = torch.where(moves | glows, float(Shape.PAD), shape)
     # A light has one view where the rig has two per frame; its second is dropped again.
     eyes = world_from_light[:, None, None].expand(-1, 1, 2, -1, -1)
-    both, _ = _in_views(still, [_at_start(s) for s in shots], eyes)
+    both, _ = in_views(still, [replace(s, times_s=np.zeros(1)) for s in shots], eyes)
     keep = torch.arange(len(both.shape), device=rows.device).view(len(shots), 2, -1)[:, 0].flatten()
     single = Primitives(
         both.shape[keep], both.local_from_view[:, keep], both.view_from_local[keep],
@@ -213,11 +136,6 @@ def _shadow_maps(rows: Tensor, shots: list[Shot]) -> tuple[Tensor, Tensor, list[
     middle = torch.full_like(focal, (resolution - 1) / 2)
     cameras = Cameras(focal, focal, middle, middle, resolution, resolution)
     return cast(single, cameras).depth_m, world_from_light, focals
-
-
-def _at_start(shot: Shot) -> Shot:
-    return Shot(shot.scene, shot.world_from_left[:1], shot.times_s[:1] * 0, shot.focal_px,
-                shot.cx, shot.cy, shot.baseline_m)  # fmt: skip
 
 
 def _color(
@@ -289,7 +207,7 @@ def _nearest_of(primitives: Primitives, candidates: Tensor, x: Tensor, y: Tensor
 def _develop(color: Tensor, shots: list[Shot]) -> Tensor:
     """Linear RGB [B, V, H, W, 3] to uint8: one exposure a clip, a soft shoulder, gamma."""
     brightness = color[:, :1].mean(dim=(1, 2, 3, 4)).clamp(min=1e-3)
-    aim = _column([s.scene.exposure for s in shots], color.device)
+    aim = column([s.scene.exposure for s in shots], color.device)
     exposed = color * (aim / brightness)[:, None, None, None, None]
     # The shoulder maps 4 to 1 and hardly touches what is below one half.
     rolled = exposed * (1 + exposed / 16) / (1 + exposed)

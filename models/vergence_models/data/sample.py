@@ -22,11 +22,12 @@ from vergence_models.data import furniture
 from vergence_models.data.clips import StereoClips
 from vergence_models.data.materials import Material, Palette
 from vergence_models.data.pool import DISPARITY_SCALE
-from vergence_models.data.render import Shot, render
+from vergence_models.data.render import render
 from vergence_models.data.scenes import Builder, Light, Scene
 from vergence_models.data.shapes import Cutout
 from vergence_models.data.textures import TextureBank
 from vergence_models.data.trajectories import HeadMotion, rotation
+from vergence_models.data.views import Shot
 
 _RATE_HZ = 30
 _BASELINE_M = 0.1

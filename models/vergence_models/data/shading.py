@@ -69,11 +69,7 @@ def _shade_chunk(
     shape, material = rows[15], rows[16:]
     normal_local = _gradient(shape, p)
     normal_metric = _unit(normal_local / half)
-
-    # Normals follow the inverse transpose, so the rows of local_from_view take them to the view.
-    a = rows[:12].view(3, 4, -1)
-    normal = (a[0, :3] * normal_local[0]) + (a[1, :3] * normal_local[1])
-    normal = _unit(normal + a[2, :3] * normal_local[2])
+    normal = _normal_in_view(rows[:12], normal_local)
     ray = torch.stack([x, y, torch.ones_like(x)])
     ray_length = (x * x + y * y + 1).sqrt()
     against = _dot(normal, ray)
@@ -96,6 +92,23 @@ def _shade_chunk(
         share = mirror[shiny]
         color[:, shiny] = color[:, shiny] * (1 - share) + around * share
     return color.t(), surface
+
+
+def _normal_in_view(local_from_view: Tensor, normal_local: Tensor) -> Tensor:
+    """Unit normals [3, N]: they follow the inverse transpose, that is the rows of the inverse."""
+    a = local_from_view.view(3, 4, -1)
+    along_x, along_y, along_z = (a[i, :3] * normal_local[i] for i in range(3))
+    return _unit(along_x + along_y + along_z)
+
+
+def view_normals(table: Tensor, m: Tensor, ray_x: Tensor, ray_y: Tensor, depth_m: Tensor) -> Tensor:
+    """Unit normals [3, N] in view axes, towards the eye, where camera rays hit primitives m [N]."""
+    rows = table.index_select(1, m)
+    origin, direction = to_local(rows[:12], ray_x, ray_y)
+    hit = torch.stack([o + depth_m * d for o, d in zip(origin, direction, strict=True)])
+    normal = _normal_in_view(rows[:12], _gradient(rows[15], hit))
+    ray = torch.stack([ray_x, ray_y, torch.ones_like(ray_x)])
+    return -normal * _dot(normal, ray).sign()
 
 
 def _gradient(shape: Tensor, p: Tensor) -> Tensor:

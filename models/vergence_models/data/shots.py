@@ -8,11 +8,11 @@ import numpy as np
 
 from vergence_models.data.materials import Palette
 from vergence_models.data.outdoors import street, swarm
-from vergence_models.data.render import Shot
 from vergence_models.data.rooms import clutter, room
 from vergence_models.data.scenes import Scene
 from vergence_models.data.settings import Viewpoint
 from vergence_models.data.trajectories import HeadMotion, rotation
+from vergence_models.data.views import Shot
 
 
 @dataclass(frozen=True, slots=True)
