@@ -21,7 +21,8 @@ from vergence_proto.errors import BadSequence, UploadTooLarge
 
 _CHUNK = 1 << 20
 _LONGEST_NAME = 512
-_ZIP_START = b"PK\x03\x04"
+_LONGEST_PART_BYTES = 255  # of what file systems take
+_ZIP_START = b"PK"
 _DECOMPRESSORS: dict[bytes, Callable[[Path], BufferedIOBase]] = {
     b"\x1f\x8b": gzip.GzipFile,
     b"BZh": bz2.BZ2File,
@@ -108,11 +109,16 @@ def _place(folder: Path, name: str) -> Path:
     path = PurePosixPath(name)
     parts = [part for part in path.parts if part != "."]
     bad = not parts or path.is_absolute() or len(name) > _LONGEST_NAME
-    if bad or any(part == ".." or set(part) & set("\\:\0") for part in parts):
+    if bad or any(map(_is_bad_part, parts)):
         raise BadSequence(
             f"expected names that lead below the archive's own folder, got {name[:100]!r}"
         )
     return folder.joinpath(*parts)
+
+
+def _is_bad_part(part: str) -> bool:
+    too_long = len(part.encode()) > _LONGEST_PART_BYTES
+    return too_long or part == ".." or not set(part).isdisjoint("\\:\0")
 
 
 def _write(member: _Member, path: Path, budget: _Budget) -> None:

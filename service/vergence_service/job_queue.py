@@ -255,13 +255,13 @@ class JobQueue:
             )
 
     async def _end(self, job: Job) -> None:
-        """The job has ended: its input goes, its result counts from now on."""
-        folder = self._store.folder(job.job_id)
-        await asyncio.to_thread(remove_folder, folder / "input")
-        if job.state is JobState.FAILED:
-            await asyncio.to_thread(remove_folder, folder / "result")
-        taken = await asyncio.to_thread(folder_bytes, folder)
-        await self._publish(replace(job, finished_s=time.time(), disk_bytes=taken))
+        result = self._store.folder(job.job_id) / "result"
+        done = job.state is JobState.DONE
+        taken = await asyncio.to_thread(folder_bytes, result) if done else 0
+        job = replace(job, finished_s=time.time(), disk_bytes=taken)
+        await self._publish(job)
+        # Only now: a server that is killed before the row says so needs the input again.
+        await asyncio.to_thread(self._store.tidy, job)
 
     async def _publish(self, job: Job) -> None:
         await asyncio.to_thread(self._store.update, job)

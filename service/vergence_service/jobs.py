@@ -138,8 +138,7 @@ class JobStore:
 
     def accept(self, folder: Path, job: Job) -> None:
         """Take an upload over; the job survives whatever happens to the process from here on."""
-        if sys.platform != "win32":
-            os.sync()  # the many files of the upload at once, before the row that promises them
+        _flush()
         folder.rename(self.folder(job.job_id))
         with self._turn:
             self._database.execute(
@@ -148,7 +147,9 @@ class JobStore:
             )
 
     def update(self, job: Job) -> None:
-        """Of a job that was deleted, nothing comes back."""
+        """Say how the job stands; of one that was deleted nothing comes back."""
+        if job.ended:
+            _flush()
         with self._turn:
             self._database.execute(
                 "UPDATE jobs SET state = ?, document = ? WHERE job_id = ?",
@@ -164,12 +165,28 @@ class JobStore:
     def folder(self, job_id: str) -> Path:
         return self._directory / "jobs" / job_id
 
+    def tidy(self, job: Job) -> None:
+        """Remove what a job that has ended does not need any more."""
+        remove_folder(self.folder(job.job_id) / "input")
+        if job.state is JobState.FAILED:
+            remove_folder(self.folder(job.job_id) / "result")
+
     def _clear_leftovers(self) -> None:
-        known = {job.job_id for job in self.load()}
+        jobs = self.load()
+        for job in jobs:
+            if job.ended:
+                self.tidy(job)
+        known = {job.job_id for job in jobs}
         unfinished = (self._directory / "incoming").iterdir()
         orphans = (each for each in (self._directory / "jobs").iterdir() if each.name not in known)
         for folder in [*unfinished, *orphans]:
             remove_folder(folder)
+
+
+def _flush() -> None:
+    """All files to the disk at once, before the row that promises them."""
+    if sys.platform != "win32":
+        os.sync()
 
 
 def remove_folder(folder: Path) -> None:

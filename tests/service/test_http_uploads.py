@@ -1,0 +1,292 @@
+"""What is uploaded may be anything: it is refused with a reason, and leaves nothing behind."""
+
+import asyncio
+import io
+import json
+import struct
+import tarfile
+import zipfile
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tests.support.http import ZIP, ended, http_server, http_to, reason_of, submit
+from tests.support.models import RecallModel
+from tests.support.sequences import (
+    CALIBRATION,
+    make_frames,
+    png,
+    sequence_files,
+    tar_bytes,
+    zip_bytes,
+)
+from tests.support.server import PATIENCE_S, running_server
+
+FILES = dict(sequence_files(make_frames(2)))
+TAR = {"Content-Type": "application/x-tar"}
+
+
+@dataclass(frozen=True)
+class Hostile:
+    body: Callable[[], bytes]
+    reason: str
+    status: int = 400
+    headers: tuple[tuple[str, str], ...] = tuple(ZIP.items())
+    query: str = ""
+    says: str = ""
+
+
+def with_file(name: str, content: bytes = b"x") -> bytes:
+    return zip_bytes([*FILES.items(), (name, content)])
+
+
+def zip_link() -> bytes:
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w") as file:
+        link = zipfile.ZipInfo("room")
+        link.external_attr = 0o120777 << 16
+        file.writestr(link, "/etc")
+    return archive.getvalue()
+
+
+def tar_of(kind: bytes, target: str = "") -> bytes:
+    archive = io.BytesIO()
+    with tarfile.open(fileobj=archive, mode="w") as file:
+        info = tarfile.TarInfo("room")
+        info.type, info.linkname = kind, target
+        file.addfile(info)
+    return archive.getvalue()
+
+
+def zip_that_lies(declared: int) -> bytes:
+    """A megabyte of zeros that the archive says is ``declared`` bytes."""
+    honest = zip_bytes([("zeros", bytes(1 << 20))], compressed=True)
+    true, false = struct.pack("<I", 1 << 20), struct.pack("<I", declared)
+    return honest.replace(true, false)
+
+
+def encrypted_zip() -> bytes:
+    plain = bytearray(zip_bytes([("secret", b"x")]))
+    plain[6] |= 1  # of the file
+    plain[plain.index(b"PK\x01\x02") + 8] |= 1  # of the directory
+    return bytes(plain)
+
+
+def tar_with_endless_header() -> bytes:
+    """A pax header that says it is a gigabyte, compressed to nothing."""
+    info = tarfile.TarInfo("pax")
+    info.type, info.size = tarfile.XHDTYPE, 1 << 30
+    packer = zlib.compressobj(wbits=31)
+    return packer.compress(info.tobuf(tarfile.USTAR_FORMAT) + bytes(1 << 22)) + packer.flush()
+
+
+def changed(**files: bytes) -> bytes:
+    return zip_bytes({**FILES, **{f"{name}.json": file for name, file in files.items()}}.items())
+
+
+HOSTILE = {
+    "not an archive": Hostile(lambda: b"hello", "BAD_SEQUENCE"),
+    "nothing": Hostile(lambda: b"", "BAD_SEQUENCE"),
+    "html": Hostile(
+        lambda: b"<html>",
+        "BAD_SEQUENCE",
+        headers=(("Content-Type", "text/html"),),
+        says="text/html",
+    ),
+    "half a zip": Hostile(lambda: zip_bytes(FILES.items())[:-100], "BAD_SEQUENCE"),
+    "half a tar.gz": Hostile(lambda: tar_bytes(FILES.items())[:-100], "BAD_SEQUENCE"),
+    "an empty zip": Hostile(lambda: zip_bytes([]), "BAD_SEQUENCE", says="vergence"),
+    "damaged inside": Hostile(
+        lambda: zip_bytes(FILES.items()).replace(b"fps", b"fsp"), "BAD_SEQUENCE", says="CRC"
+    ),
+    "path up": Hostile(lambda: with_file("../../evil"), "BAD_SEQUENCE", says="below"),
+    "path from the root": Hostile(lambda: with_file("/etc/evil"), "BAD_SEQUENCE", says="below"),
+    "path of Windows": Hostile(lambda: with_file("C:\\evil"), "BAD_SEQUENCE", says="below"),
+    "tar path up": Hostile(
+        lambda: tar_bytes([("a/../../evil", b"x")], "w"), "BAD_SEQUENCE", says="below"
+    ),
+    "twice the same name": Hostile(
+        lambda: with_file("calib.json/calib.json"), "BAD_SEQUENCE", says="twice"
+    ),
+    "a name as long as a book": Hostile(lambda: with_file("n" * 600), "BAD_SEQUENCE"),
+    "a part of a name too long": Hostile(lambda: with_file("n" * 300), "BAD_SEQUENCE"),
+    "zip with a link": Hostile(zip_link, "BAD_SEQUENCE", says="link"),
+    "tar with a link": Hostile(lambda: tar_of(tarfile.SYMTYPE, "/etc"), "BAD_SEQUENCE"),
+    "tar with a hard link": Hostile(lambda: tar_of(tarfile.LNKTYPE, "/etc/passwd"), "BAD_SEQUENCE"),
+    "tar with a device": Hostile(lambda: tar_of(tarfile.CHRTYPE), "BAD_SEQUENCE"),
+    "with a password": Hostile(encrypted_zip, "BAD_SEQUENCE", says="password"),
+    "bomb by its own word": Hostile(
+        lambda: zip_bytes([("zeros", bytes(40 << 20))], compressed=True), "UPLOAD_TOO_LARGE", 413
+    ),
+    "bomb by ratio": Hostile(
+        lambda: zip_bytes([("zeros", bytes(2 << 20))], compressed=True), "UPLOAD_TOO_LARGE", 413
+    ),
+    "bomb that lies": Hostile(lambda: zip_that_lies(10), "BAD_SEQUENCE"),
+    "tar bomb": Hostile(lambda: tar_bytes([("zeros", bytes(2 << 20))]), "UPLOAD_TOO_LARGE", 413),
+    "endless header": Hostile(tar_with_endless_header, "BAD_SEQUENCE", says="header"),
+    "too many files": Hostile(
+        lambda: zip_bytes((str(n), b"") for n in range(300)), "UPLOAD_TOO_LARGE", 413
+    ),
+    "too many bytes": Hostile(lambda: bytes(5 << 20), "UPLOAD_TOO_LARGE", 413),
+    "two sequences": Hostile(
+        lambda: zip_bytes(
+            (f"{room}/{name}", file) for room in "ab" for name, file in FILES.items()
+        ),
+        "BAD_SEQUENCE",
+        says="vergence:a, vergence:b",
+    ),
+    "a source that leads out": Hostile(
+        lambda: zip_bytes(FILES.items()), "BAD_SEQUENCE", query="?source=vergence:../.."
+    ),
+    "a source of no kind": Hostile(
+        lambda: zip_bytes(FILES.items()), "BAD_SEQUENCE", query="?source=room"
+    ),
+    "a million pixels squared": Hostile(
+        lambda: changed(
+            calib=json.dumps({**CALIBRATION, "width": 10**6, "height": 10**6}).encode()
+        ),
+        "FRAME_TOO_LARGE",
+        413,
+    ),
+    "no baseline": Hostile(
+        lambda: changed(calib=json.dumps({**CALIBRATION, "baseline_m": 0}).encode()),
+        "BAD_SEQUENCE",
+        says="baseline",
+    ),
+    "another model": Hostile(
+        lambda: zip_bytes(FILES.items()), "BAD_SHAPE", query="?model=full", says="recall"
+    ),
+    "an option misspelt": Hostile(
+        lambda: zip_bytes(FILES.items()), "BAD_SHAPE", query="?iteration=3", says="iteration"
+    ),
+}
+
+
+async def test_hostile_uploads_are_refused_and_leave_nothing_behind(tmp_path: Path) -> None:
+    limits = {
+        "batch__max_files": 200,
+        "batch__max_upload_mib": 4,
+        "batch__max_unpacked_mib": 32,
+        "batch__directory": tmp_path,
+    }
+    async with http_server(RecallModel(), **limits) as client:
+        for what, upload in HOSTILE.items():
+            answer = await client.post(
+                f"/v1/sequences{upload.query}", content=upload.body(), headers=dict(upload.headers)
+            )
+            told = (answer.status_code, reason_of(answer))
+            assert told == (upload.status, upload.reason), (what, answer.text)
+            assert upload.says in answer.text, (what, answer.text)
+            assert str(tmp_path) not in answer.text, what
+            assert not [*(tmp_path / "incoming").iterdir(), *(tmp_path / "jobs").iterdir()], what
+        fine = await submit(client, zip_bytes(FILES.items()))
+        assert (await ended(client, fine["id"]))["state"] == "done"
+
+
+FORMS: dict[str, tuple[list[tuple[str, bytes]], str]] = {
+    "no calibration": ([("left", b"x"), ("right", b"x")], "sequence"),
+    "calibration without a baseline": (
+        [("left", b"x"), ("right", b"x"), ("sequence", b'{"calibration": {"width": 3}}')],
+        "baseline_m",
+    ),
+    "not JSON": ([("left", b"x"), ("right", b"x"), ("sequence", b"{")], "JSON"),
+    "one image too few": (
+        [
+            ("left", png(make_frames(1)[0].left)),
+            ("left", png(make_frames(1)[0].left)),
+            ("right", png(make_frames(1)[0].right)),
+            ("sequence", json.dumps({"calibration": CALIBRATION}).encode()),
+        ],
+        "2 left, 1 right",
+    ),
+    "no image": (
+        [
+            ("left", b"GIF89a"),
+            ("right", b"GIF89a"),
+            ("sequence", json.dumps({"calibration": CALIBRATION}).encode()),
+        ],
+        "PNG, JPEG or WebP",
+    ),
+    "two archives": ([("archive", b"PK"), ("archive", b"PK")], "archive"),
+}
+
+
+async def test_forms_are_refused_with_what_they_lack(tmp_path: Path) -> None:
+    async with http_server(RecallModel(), batch__directory=tmp_path) as client:
+        for what, (files, says) in FORMS.items():
+            answer = await client.post("/v1/sequences", files=files)
+            assert reason_of(answer) == "BAD_SEQUENCE", what
+            assert says in answer.text, (what, answer.text)
+        cut = await client.post(
+            "/v1/sequences",
+            content=b'--b\r\nContent-Disposition: form-data; name="left"\r\n\r\nhalf',
+            headers={"Content-Type": "multipart/form-data; boundary=b"},
+        )
+        assert "cut short" in cut.text
+        assert not [*(tmp_path / "incoming").iterdir(), *(tmp_path / "jobs").iterdir()]
+
+
+async def test_an_image_that_cannot_be_read_fails_its_job_and_names_it() -> None:
+    files = {**FILES, "frame_0001_left.png": FILES["frame_0001_left.png"][:200]}
+    async with http_server(RecallModel()) as client:
+        job = await ended(client, (await submit(client, zip_bytes(files.items())))["id"])
+    assert (job["state"], job["reason"]) == ("failed", "BAD_SEQUENCE")
+    assert job["message"].startswith("frame_0001_left.png: ")
+
+
+PAIR = {"left": png(make_frames(1)[0].left), "right": png(make_frames(1)[0].right)}
+
+
+@pytest.mark.parametrize(
+    ("files", "query", "reason"),
+    [
+        pytest.param({"left": PAIR["left"]}, "", "BAD_IMAGE", id="one image"),
+        pytest.param({**PAIR, "left": b"x"}, "", "BAD_IMAGE", id="no image"),
+        pytest.param(
+            {**PAIR, "left": png(make_frames(1)[0].left[:20])}, "", "BAD_SHAPE", id="two sizes"
+        ),
+        pytest.param(PAIR, "?output=depth", "BAD_CALIBRATION", id="depth of no camera"),
+        pytest.param(PAIR, "?format=gif", "BAD_SHAPE", id="format"),
+    ],
+)
+async def test_a_bad_pair_is_refused(files: dict[str, bytes], query: str, reason: str) -> None:
+    async with http_server(RecallModel()) as client:
+        answer = await client.post(f"/v1/pairs{query}", files=files)
+    assert (answer.status_code, reason_of(answer)) == (400, reason)
+
+
+async def test_an_upload_that_breaks_off_or_stalls_leaves_nothing_behind(tmp_path: Path) -> None:
+    flags = {"batch__directory": tmp_path, "batch__idle_s": 0.2}
+    incoming = tmp_path / "incoming"
+    async with running_server(RecallModel(), **flags) as server, http_to(server) as client:
+        host, port = server.http_address.split(":")
+        for breaks_off in (True, False):
+            reader, writer = await asyncio.open_connection(host, int(port))
+            writer.write(
+                b"POST /v1/sequences HTTP/1.1\r\nHost: here\r\nContent-Type: application/zip\r\n"
+                b"Connection: close\r\nContent-Length: 1000000\r\n\r\nPK\x03\x04"
+            )
+            await writer.drain()
+            await holds_something(incoming)
+            if not breaks_off:
+                answer = await asyncio.wait_for(reader.read(), PATIENCE_S)
+                assert b"400 Bad Request" in answer
+                assert b"stopped for 0.2 s after 4 bytes" in answer
+            writer.close()
+            await emptied(incoming)
+        await submit(client, zip_bytes(FILES.items()))
+
+
+async def holds_something(folder: Path) -> None:
+    async with asyncio.timeout(PATIENCE_S):
+        while not [*folder.iterdir()]:  # noqa: ASYNC110  the server's files are all that tells
+            await asyncio.sleep(0.01)
+
+
+async def emptied(folder: Path) -> None:
+    async with asyncio.timeout(PATIENCE_S):
+        while [*folder.iterdir()]:  # noqa: ASYNC110
+            await asyncio.sleep(0.01)
