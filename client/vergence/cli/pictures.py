@@ -22,6 +22,7 @@ _TEXT = (228, 224, 220)
 _FAINT = (150, 144, 138)
 _FONT = cv2.FONT_HERSHEY_DUPLEX
 _MARGIN = 16
+_BAR_HEIGHT = 50
 _LARGEST_POINT_PX = 13
 
 
@@ -43,7 +44,7 @@ class Scale:
 
     def bar(self, width: int) -> Picture:
         """The scale itself with its ticks, ``width`` pixels wide."""
-        height, ramp_height = 46, 12
+        height, ramp_height = _BAR_HEIGHT, 12
         picture = _blank(height, width)
         ramp = np.linspace(0, self.top_px, width, dtype=np.float32)
         picture[:ramp_height] = self.paint(np.tile(ramp, (ramp_height, 1)))
@@ -53,7 +54,7 @@ class Scale:
             text_width = _text_width(label, 0.4)
             x = round(share * (width - 1) - share * text_width)
             _write(picture, label, x, ramp_height + 16, 0.4, _FAINT)
-        _write(picture, f"{self.name}, px", 0, height - 2, 0.4, _FAINT)
+        _write(picture, f"{self.name}, px", 0, height - 6, 0.4, _FAINT)
         return picture
 
 
@@ -166,11 +167,11 @@ def _strip(row: Row, scale: Scale, panel_width: int) -> Picture:
 
 def _scales(row: Row, scale: Scale, panel_width: int) -> Picture:
     scales = [None, scale] if row.truth_px is None else [None, scale, ERROR_SCALE]
-    picture = _blank(46 + _MARGIN, _width(len(scales), panel_width))
+    picture = _blank(_BAR_HEIGHT + _MARGIN, _width(len(scales), panel_width))
     for column, each in enumerate(scales):
         if each is not None:
             x = _column(column, panel_width)
-            picture[:46, x : x + panel_width] = each.bar(panel_width)
+            picture[:_BAR_HEIGHT, x : x + panel_width] = each.bar(panel_width)
     return picture
 
 
