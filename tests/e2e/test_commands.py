@@ -17,7 +17,9 @@ PATIENCE_S = 60.0
 REPOSITORY = Path(__file__).parents[2]
 
 
-def vergence(*arguments: object, without: str = "") -> subprocess.CompletedProcess[str]:
+def vergence(
+    *arguments: object, without: str = "", cwd: Path | None = None, **environment: str
+) -> subprocess.CompletedProcess[str]:
     """Run the command; ``without`` is a package that shall not be importable."""
     hidden = f"sys.modules[{without!r}] = None; " if without else ""
     code = (
@@ -28,7 +30,8 @@ def vergence(*arguments: object, without: str = "") -> subprocess.CompletedProce
         capture_output=True,
         text=True,
         timeout=PATIENCE_S,
-        env={**os.environ, "COLUMNS": "200", "NO_COLOR": "1"},
+        cwd=cwd,
+        env={**os.environ, "COLUMNS": "200", "NO_COLOR": "1", **environment},
         check=False,
     )
 
@@ -129,16 +132,17 @@ def test_run_at_a_rate_accounts_for_every_frame(wall: Path, server: str, tmp_pat
         (["run", "WALL", "--rate", "soon"], 2, "expected a rate in Hz, source or max"),
         (["run", "WALL", "--server", "http://x"], 2, "expected a server as grpc://HOST:PORT"),
         (["run", "WALL", "--server", "127.0.0.1:1"], 1, "no connection to 127.0.0.1:1"),
+        (["run", "WALL", "--out", "/dev/null/here"], 1, "/dev/null/here"),
         (["demo", "--source", "kitti:here"], 2, "expected KITTI's camera projections"),
     ],
-    ids=["kind", "folder", "rate", "scheme", "nobody-there", "demo"],
+    ids=["kind", "folder", "rate", "scheme", "nobody-there", "unwritable", "demo"],
 )
 def test_what_a_person_got_wrong_is_told_without_a_trace(
     wall: Path, tmp_path: Path, arguments: list[str], code: int, told: str
 ) -> None:
     done = vergence(
         *(f"vergence:{wall}" if argument == "WALL" else argument for argument in arguments),
-        *("--out", tmp_path / "out"),
+        cwd=tmp_path,
     )
     assert done.returncode == code
     assert told in done.stderr
@@ -173,12 +177,20 @@ def test_what_is_not_installed_is_told_with_the_extra_that_brings_it(
     assert "Traceback" not in done.stderr
 
 
-def test_a_server_that_does_not_start_is_quoted(wall: Path, tmp_path: Path) -> None:
-    done = vergence(
-        *("run", f"vergence:{wall}", "--out", tmp_path / "out"), without="vergence_service"
-    )
+def test_no_server_to_start_is_told_with_the_extra_that_brings_it(
+    wall: Path, tmp_path: Path
+) -> None:
+    done = vergence("run", f"vergence:{wall}", without="vergence_service", cwd=tmp_path)
     assert done.returncode == 1
     assert "vergence[server]" in done.stderr
+
+
+def test_a_server_that_does_not_start_is_quoted(wall: Path, tmp_path: Path) -> None:
+    done = vergence("run", f"vergence:{wall}", cwd=tmp_path, VERGENCE_MODEL__NAME="grand")
+    assert done.returncode == 1
+    assert "the server did not start" in done.stderr
+    assert "no model 'grand'" in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 def test_doctor_finds_the_weights_and_a_running_server(server: str) -> None:

@@ -37,7 +37,7 @@ def run_program() -> None:
     """Run the command line; trouble is one line on stderr and the exit code."""
     try:
         app()
-    except (Trouble, DepthError) as trouble:
+    except (Trouble, DepthError, OSError) as trouble:  # OSError: a file that cannot be written
         Console(stderr=True, soft_wrap=True, highlight=False).print(
             f"vergence: {trouble}", style="red", markup=False
         )
