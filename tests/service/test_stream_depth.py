@@ -1,6 +1,7 @@
 """The live call over a real gRPC server: answers, order, freshness, flow."""
 
 import asyncio
+from typing import Any
 
 import numpy as np
 import pytest
@@ -140,7 +141,7 @@ async def test_a_client_that_does_not_read_is_not_sent_what_is_old_by_then() -> 
 
 async def test_two_clients_at_once_get_what_each_gets_alone_from_the_weights_that_ship() -> None:
     rig = RectifiedRig(256, 128, 200.0, 200.0, 127.5, 127.5, 63.5, 0.1)
-    opening = {"rig": StereoRig.from_rectified(rig)}
+    opening: dict[str, Any] = {"rig": StereoRig.from_rectified(rig)}
 
     async def walk(call: RawCall, brightness: int) -> list[bytes]:
         frames = (make_frame(i, brightness=brightness, rig=rig) for i in range(1, 6))
