@@ -142,9 +142,7 @@ class ZenohPeer:
         await done.wait()
         return [_answer(reply) for reply in replies]
 
-    async def subscribe(
-        self, key: str, received: Callable[[zenoh.Sample], None]
-    ) -> Undeclarable:
+    async def subscribe(self, key: str, received: Callable[[zenoh.Sample], None]) -> Undeclarable:
         """``received`` is called in Zenoh's thread: it must not call Zenoh, nor wait."""
         handler = Callback(received, indirect=False)
         return await self._in_thread(lambda: self._session.declare_subscriber(key, handler))
@@ -180,7 +178,7 @@ class ZenohPeer:
         """``died`` is called in the event loop with the key of every token that goes."""
 
         def changed(sample: zenoh.Sample) -> None:
-            if sample.kind is zenoh.SampleKind.DELETE:
+            if sample.kind == zenoh.SampleKind.DELETE:
                 died(str(sample.key_expr))
 
         handler = Callback(self._to_loop(changed), indirect=False)

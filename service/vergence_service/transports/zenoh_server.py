@@ -87,10 +87,14 @@ class ZenohServer:
 
     async def serving(self) -> None:
         """Answer, and tell those on the network that this server lives."""
-        client_keys = StreamKeys(self._namespace, ANY).client(ANY)
-        await self._peer.watch_deaths(client_keys, self._client_died)
-        await self._peer.answer_queries(ask_key(self._namespace, self._peer.id, ANY), self._asked)
-        await self._peer.declare_alive(server_key(self._namespace, self._peer.id))
+        peer, namespace = self._peer, self._namespace
+        client_keys = StreamKeys(namespace, ANY).client(ANY)
+        # Held for as long as this server serves: Zenoh ends what nobody refers to.
+        self._declared = [
+            await peer.watch_deaths(client_keys, self._client_died),
+            await peer.answer_queries(ask_key(namespace, peer.id, ANY), self._asked),
+            await peer.declare_alive(server_key(namespace, peer.id)),
+        ]
 
     async def drain(self, *, within_s: float) -> None:
         """Let calls end by themselves, then answer what they have sent and end them."""
