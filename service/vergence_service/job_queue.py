@@ -22,6 +22,7 @@ from vergence_proto.errors import (
     UploadTooLarge,
 )
 from vergence_proto.layouts import StereoSource
+from vergence_service.contents import check_folder
 from vergence_service.engine import DepthEngine
 from vergence_service.job_run import opening_of, run_job
 from vergence_service.jobs import (
@@ -129,9 +130,10 @@ class JobQueue:
         """Take the sequence below ``folder``/input; from the return on it will not be lost.
 
         ``wanted`` is KIND:PATH, and needed where there are several. Raises BadSequence, QueueFull,
-        UploadTooLarge, and what DepthEngine.open_apart raises.
+        UploadTooLarge, FrameTooLarge, and what DepthEngine.open_apart raises.
         """
-        spec, source = await asyncio.to_thread(_find, folder / "input", wanted)
+        limit = self._engine.max_pixels
+        spec, source = await asyncio.to_thread(_find, folder / "input", wanted, max_pixels=limit)
         await self._engine.open_apart(opening_of(source.rig, options))  # for its refusals
         uploaded = await asyncio.to_thread(folder_bytes, folder)
         job = Job(
@@ -337,7 +339,8 @@ class JobQueue:
         return _USUAL_JOB_S
 
 
-def _find(folder: Path, wanted: str | None) -> tuple[str, StereoSource]:
+def _find(folder: Path, wanted: str | None, *, max_pixels: int) -> tuple[str, StereoSource]:
+    check_folder(folder, max_pixels=max_pixels)
     spec = find_sequence(folder, wanted)
     return spec, open_below(folder, spec)
 

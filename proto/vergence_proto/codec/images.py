@@ -95,12 +95,7 @@ def decode_image(data: bytes) -> Image:
 
     Raises BadImage: no such file, or one that is cut short or damaged.
     """
-    if data.startswith(_JPEG_START):
-        size = _jpeg_size(data)
-    elif data.startswith(_PNG_SIGNATURE):
-        size = _png_size(data)
-    else:
-        size = None
+    size = image_size(data)
     try:
         decoded = cv2.imdecode(np.frombuffer(data, np.uint8), _DECODE_FLAGS) if data else None
     except cv2.error as error:
@@ -108,6 +103,20 @@ def decode_image(data: bytes) -> Image:
     if decoded is None or (size and decoded.shape[1::-1] != size):
         raise BadImage(f"{len(data)} bytes starting {data[:8]!r} are no image, or a damaged one")
     return np.asarray(cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB, dst=decoded), np.uint8)
+
+
+def image_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height that a PNG, JPEG or WebP file states, without decoding it; else None.
+
+    Raises BadImage: a PNG or JPEG that is cut short, or without a header.
+    """
+    if data.startswith(_JPEG_START):
+        return _jpeg_size(data)
+    if data.startswith(_PNG_SIGNATURE):
+        return _png_size(data)
+    if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
+        return _webp_size(data)
+    return None
 
 
 def _from_raw(message: pb.Image, data: bytes) -> Image:
@@ -137,6 +146,22 @@ def _png_size(data: bytes) -> tuple[int, int]:
         raise BadImage(f"the PNG of {len(data)} bytes is cut short: its end chunk is missing")
     width, height = struct.unpack(">II", data[16:24])
     return width, height
+
+
+def _webp_size(data: bytes) -> tuple[int, int] | None:
+    match data[12:16]:
+        case b"VP8X":
+            return (
+                1 + int.from_bytes(data[24:27], "little"),
+                1 + int.from_bytes(data[27:30], "little"),
+            )
+        case b"VP8L":
+            bits = int.from_bytes(data[21:25], "little")
+            return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
+        case b"VP8 ":
+            width, height = struct.unpack("<HH", data[26:30].ljust(4, b"\0"))
+            return width & 0x3FFF, height & 0x3FFF
+    return None
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int]:

@@ -11,10 +11,11 @@ import numpy as np
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
 
-from vergence_proto.errors import BadCalibration, BadImage, BadShape
+from vergence_proto.errors import BadCalibration, BadImage, BadShape, FrameTooLarge
 from vergence_proto.geometry import RectifiedRig
 from vergence_proto.layouts import LayoutError, encode_disparity_png, read_image
 from vergence_proto.types import Image, Plane, StereoFrame, StereoRig
+from vergence_service.contents import check_file
 from vergence_service.engine import DepthEngine
 from vergence_service.job_run import opening_of
 from vergence_service.jobs import JobOptions
@@ -81,7 +82,7 @@ def pair_routes(engine: DepthEngine, *, limits: UploadLimits) -> APIRouter:
 
         `curl -F left=@left.png -F right=@right.png HOST/v1/pairs -o disparity.png`
         """
-        left, right = await _images(request, limits)
+        left, right = await _images(request, limits, max_pixels=engine.max_pixels)
         height, width = left.shape[:2]
         nominal_px = float(width)  # disparity is the same for every focal length
         rig = RectifiedRig(
@@ -106,7 +107,9 @@ def pair_routes(engine: DepthEngine, *, limits: UploadLimits) -> APIRouter:
     return router
 
 
-async def _images(request: Request, limits: UploadLimits) -> tuple[Image, Image]:
+async def _images(
+    request: Request, limits: UploadLimits, *, max_pixels: int
+) -> tuple[Image, Image]:
     if media_type(request) != FORM_TYPE:
         raise BadImage(f"expected a body of {FORM_TYPE} with the files left and right")
     with tempfile.TemporaryDirectory() as scratch:
@@ -115,7 +118,8 @@ async def _images(request: Request, limits: UploadLimits) -> tuple[Image, Image]
             names = sorted(part.name[:40] for part in parts)
             raise BadImage(f"expected one file left and one file right, got {names}")
         images = {
-            part.name: await asyncio.to_thread(_image, part.path, part.name) for part in parts
+            part.name: await asyncio.to_thread(_image, part.path, part.name, max_pixels)
+            for part in parts
         }
     left, right = images["left"], images["right"]
     if left.shape != right.shape:
@@ -126,10 +130,13 @@ async def _images(request: Request, limits: UploadLimits) -> tuple[Image, Image]
     return left, right
 
 
-def _image(path: Path, name: str) -> Image:
+def _image(path: Path, name: str, max_pixels: int) -> Image:
     try:
+        check_file(path, max_pixels=max_pixels)
         return read_image(path)
-    except LayoutError as error:
+    except FrameTooLarge as error:
+        raise FrameTooLarge(f"{name} image: {error}") from None
+    except (BadImage, LayoutError) as error:
         raise BadImage(f"{name} image: {str(error).removeprefix(f'{path}: ')}") from None
 
 

@@ -1,0 +1,121 @@
+"""Jobs live on disk: through restarts, until they are too old or the room is needed."""
+
+import asyncio
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tests.support.frames import frame_message, make_frame
+from tests.support.http import (
+    ZIP,
+    disparities,
+    ended,
+    files_below,
+    http_server,
+    http_to,
+    reason_of,
+    submit,
+)
+from tests.support.models import RecallModel
+from tests.support.sequences import make_frames, sequence_files, zip_bytes
+from tests.support.server import raw_stream, running_server
+from vergence_service.jobs import JobState, JobStore
+
+ARCHIVE = zip_bytes(sequence_files(make_frames(6)))
+
+
+async def test_a_stopped_server_leaves_its_jobs_to_the_next_one(tmp_path: Path) -> None:
+    model = RecallModel()
+    async with http_server(model, batch__directory=tmp_path) as client:
+        done = await submit(client, ARCHIVE)
+        await ended(client, done["id"])
+        maps = await disparities(client, done["id"])
+        with model.busy():
+            jobs = [await submit(client, ARCHIVE) for _ in range(3)]
+            await asyncio.to_thread(model.wait_until_entered)
+            # The model is freed by a thread of its own, when the server has begun to stop.
+            asyncio.get_running_loop().call_later(0.2, model.let_go)
+            await client.aclose()
+    async with http_server(RecallModel(), batch__directory=tmp_path) as client:
+        for job in jobs:
+            assert (await ended(client, job["id"]))["state"] == "done"
+            np.testing.assert_array_equal(await disparities(client, job["id"]), maps)
+        np.testing.assert_array_equal(await disparities(client, done["id"]), maps)
+
+
+async def test_a_sequence_that_keeps_killing_the_server_is_given_up(tmp_path: Path) -> None:
+    model = RecallModel()
+    async with http_server(model, batch__directory=tmp_path) as client:
+        with model.busy():
+            deadly = await submit(client, ARCHIVE)
+            asyncio.get_running_loop().call_later(0.2, model.let_go)
+            await client.aclose()
+    with JobStore(tmp_path) as store:  # as four servers would have left it
+        [job] = store.load()
+        store.update(replace(job, state=JobState.RUNNING, attempts=4))
+    async with http_server(RecallModel(), batch__directory=tmp_path) as client:
+        failed = await ended(client, deadly["id"])
+    assert (failed["state"], failed["reason"]) == ("failed", "MODEL_FAILED")
+    assert "died 4 times" in failed["message"]
+
+
+async def test_results_expire_by_age(tmp_path: Path) -> None:
+    async with http_server(RecallModel(), batch__directory=tmp_path) as client:
+        job = await submit(client, ARCHIVE)
+        await ended(client, job["id"])
+        assert files_below(tmp_path / "jobs")
+    async with http_server(RecallModel(), batch__directory=tmp_path, batch__keep_h=1e-9) as client:
+        async with asyncio.timeout(20):
+            while (await client.get("/v1/sequences")).json():  # noqa: ASYNC110  as clients wait
+                await asyncio.sleep(0.01)
+        assert not files_below(tmp_path / "jobs")
+
+
+async def test_the_oldest_results_make_room_and_what_waits_is_never_dropped(
+    tmp_path: Path,
+) -> None:
+    model = RecallModel()
+    archive = zip_bytes(sequence_files(make_frames(16)))  # of which five fit
+    flags: dict[str, Any] = {"batch__directory": tmp_path, "batch__disk_mib": 1}
+    async with http_server(model, **flags) as client:
+        job_ids = []
+        for _ in range(10):
+            job = await submit(client, archive)
+            await ended(client, job["id"])
+            job_ids.append(job["id"])
+        kept = [job["id"] for job in (await client.get("/v1/sequences")).json()]
+        assert kept == job_ids[-len(kept) :]
+        assert 0 < len(kept) < 10
+        assert sum(path.stat().st_size for path in (tmp_path / "jobs").rglob("*.npz")) < 1 << 20
+        with model.busy():
+            waiting = []
+            while True:
+                answer = await client.post("/v1/sequences", content=archive, headers=ZIP)
+                if answer.status_code != 202:
+                    break
+                waiting.append(answer.json()["id"])
+            assert (answer.status_code, reason_of(answer)) == (429, "QUEUE_FULL")
+            assert "disk" in answer.text
+        assert [(await ended(client, job_id))["state"] for job_id in waiting] == ["done"] * len(
+            waiting
+        )
+        whale = zip_bytes(sequence_files(make_frames(120)))
+        answer = await client.post("/v1/sequences", content=whale, headers=ZIP)
+        assert (answer.status_code, reason_of(answer)) == (413, "UPLOAD_TOO_LARGE")
+
+
+async def test_a_second_server_on_the_same_folder_serves_live_and_says_why_not_more(
+    tmp_path: Path,
+) -> None:
+    async with (
+        http_server(RecallModel(), batch__directory=tmp_path),
+        running_server(RecallModel(), batch__directory=tmp_path) as server,
+        http_to(server) as client,
+    ):
+        answer = await client.post("/v1/sequences", content=ARCHIVE, headers=ZIP)
+        assert (answer.status_code, reason_of(answer)) == (503, "NOT_READY")
+        assert "batch.directory" in answer.text
+        async with raw_stream(server) as call:
+            assert (await call.ask(frame_message(make_frame(1)))).disparity.frame_id == 1
