@@ -26,8 +26,8 @@ from vergence_service.settings import Settings
 from vergence_service.streams import StreamTable
 from vergence_service.transports import ExtraMissing
 from vergence_service.transports.calls import OpenCalls
+from vergence_service.transports.depth_call import StreamLimits
 from vergence_service.transports.grpc_server import DepthServicer, GrpcServer
-from vergence_service.transports.grpc_stream import StreamLimits
 from vergence_service.transports.http_app import HttpServer, make_http_app
 from vergence_service.transports.http_pairs import pair_routes
 from vergence_service.transports.http_sequences import no_sequence_routes, sequence_routes

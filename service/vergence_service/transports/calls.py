@@ -6,7 +6,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from vergence_proto.errors import Draining
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.engine import DepthEngine
-from vergence_service.transports.grpc_stream import DepthCall, StreamLimits
+from vergence_service.transports.depth_call import DepthCall, StreamLimits
 
 
 class OpenCalls:
