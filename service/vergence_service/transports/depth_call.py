@@ -1,4 +1,4 @@
-"""One StreamDepth call: a reader, a stepper and a writer, so that they overlap."""
+"""One StreamDepth call, whatever carries it: a reader, a stepper and a sender, so they overlap."""
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
@@ -7,23 +7,12 @@ from functools import partial
 
 from vergence_proto import codec
 from vergence_proto.errors import BadShape, DepthError, StreamExists, UnknownStream
-from vergence_proto.types import DisparityMap
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.engine import DepthEngine
-from vergence_service.streams import Notice, NoticeKind, Opening, Stream
+from vergence_service.streams import Notice, Opening, Stream
 from vergence_service.transports.mailbox import Letter, Mailbox
+from vergence_service.transports.outbox import Outbox
 from vergence_service.transports.unary import model_info
-
-# One map is encoded and sent while the next is stepped. Past it the stepper waits for the client
-# to read, and newer frames displace older ones in the mailbox.
-_UNSENT_MAPS = 2
-# Short answers to a client that does not read; past it its frames are not read either.
-_OUTBOX = 64
-
-_NOTICE = {
-    NoticeKind.DRAINING: pb.NOTICE_KIND_DRAINING,
-    NoticeKind.EXPIRING: pb.NOTICE_KIND_EXPIRING,
-}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,18 +20,6 @@ class StreamLimits:
     credit: int  # frames that a client may have unanswered
     waiting_frames: int  # of a lossless stream, before the sender waits
     max_frame_bytes: int
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Map:
-    disparity: DisparityMap
-    arrived_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class _Ping:
-    client_ns: int
-    arrived_s: float
 
 
 class DepthCall:
@@ -62,9 +39,7 @@ class DepthCall:
         self._write = write
         self._limits = limits
         self._clock = clock
-        self._outbox: asyncio.Queue[pb.StreamDepthResponse | _Map | _Ping | None]
-        self._outbox = asyncio.Queue(_OUTBOX)
-        self._unsent = asyncio.Semaphore(_UNSENT_MAPS)
+        self._outbox = Outbox(write, clock=clock, metrics=engine.metrics)
         self._reader: asyncio.Task[None] | None = None
         self._stepper: asyncio.Task[None] | None = None
         self._stream: Stream | None = None
@@ -72,9 +47,7 @@ class DepthCall:
         self._client_is_done = False
 
     def notify(self, notice: Notice) -> None:
-        message = pb.Notice(kind=_NOTICE[notice.kind], message=notice.message, in_s=notice.in_s)
-        if not self._outbox.full():  # a client that does not read will not read this either
-            self._outbox.put_nowait(pb.StreamDepthResponse(notice=message))
+        self._outbox.put_notice(notice)
 
     async def tell_lost(self, frame_ids: Sequence[int]) -> None:
         """Count and answer frames that, as the transport knows, were sent and never came."""
@@ -112,11 +85,11 @@ class DepthCall:
         mailbox: Mailbox[pb.Frame]
         mailbox = Mailbox(stream.opening.delivery, capacity=self._limits.waiting_frames)
         async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(self._send_answers(stream))
+            tasks.create_task(self._outbox.send())
             self._reader = tasks.create_task(self._read(stream, mailbox))
             self._stepper = tasks.create_task(self._step(stream, mailbox))
             await asyncio.wait([self._reader, self._stepper])
-            await self._outbox.put(None)
+            await self._outbox.finish()
 
     async def _open(self) -> tuple[Stream, bool]:
         first = await anext(aiter(self._requests), None)
@@ -157,7 +130,7 @@ class DepthCall:
                     case "frame":
                         await self._receive(stream, mailbox, request.frame, arrived_s)
                     case "ping":
-                        await self._outbox.put(_Ping(request.ping.client_ns, arrived_s))
+                        await self._outbox.put_pong(request.ping, arrived_s=arrived_s)
                     case "reset":
                         mailbox.reset()
                     case "end":
@@ -193,7 +166,7 @@ class DepthCall:
     async def _step(self, stream: Stream, mailbox: Mailbox[pb.Frame]) -> None:
         rig = stream.rectifier.rig
         while True:
-            await self._unsent.acquire()
+            await self._outbox.reserve_map()
             letter = await mailbox.take()
             if letter is None:
                 return
@@ -213,34 +186,13 @@ class DepthCall:
                     max_age_s=frame.max_age_s if frame.HasField("max_age_s") else None,
                 )
             except DepthError as error:
-                self._unsent.release()
+                self._outbox.release_map()
                 await self._refuse(letter.frame_id, error)
             else:
-                await self._outbox.put(_Map(disparity, letter.arrived_s))
+                await self._outbox.put_map(
+                    disparity, stream.opening.output, arrived_s=letter.arrived_s
+                )
 
     async def _refuse(self, frame_id: int, error: DepthError) -> None:
         message = codec.error_to_frame_error(frame_id, error)
         await self._outbox.put(pb.StreamDepthResponse(frame_error=message))
-
-    async def _send_answers(self, stream: Stream) -> None:
-        while (answer := await self._outbox.get()) is not None:
-            match answer:
-                case _Map():
-                    await self._write(await asyncio.to_thread(self._encoded, answer, stream))
-                    self._unsent.release()
-                case _Ping(client_ns, arrived_s):
-                    hold_ns = int((self._clock() - arrived_s) * 1e9)
-                    pong = pb.Pong(client_ns=client_ns, server_hold_ns=hold_ns)
-                    await self._write(pb.StreamDepthResponse(pong=pong))
-                case _:
-                    await self._write(answer)
-
-    def _encoded(self, answer: _Map, stream: Stream) -> pb.StreamDepthResponse:
-        started_s = self._clock()
-        message = codec.disparity_to_proto(answer.disparity, stream.opening.output)
-        done_s = self._clock()
-        message.timings.encode_us = round((done_s - started_s) * 1e6)
-        message.timings.total_us = round((done_s - answer.arrived_s) * 1e6)
-        self._engine.metrics.stage_s.labels("encode").observe(done_s - started_s)
-        self._engine.metrics.stage_s.labels("total").observe(done_s - answer.arrived_s)
-        return pb.StreamDepthResponse(disparity=message)
