@@ -42,11 +42,12 @@ def serve(
     weights: Annotated[Path | None, typer.Option(help="A folder with a manifest.")] = None,
     threads: Annotated[int | None, typer.Option(help="Of one step; 0: one a core.")] = None,
 ) -> None:
-    """Serve depth over gRPC, with health and metrics over HTTP.
+    """Serve depth over gRPC, and over Zenoh if asked; health and metrics over HTTP.
 
     Every setting is also a variable (VERGENCE_GRPC__PORT) and a key of the file; --print-config
     lists them. Flags win over variables, those over the file. Once it serves, one line on
-    standard output tells the addresses: "listening grpc=HOST:PORT http=HOST:PORT".
+    standard output tells the addresses: "listening grpc=HOST:PORT http=HOST:PORT", and
+    with Zenoh " zenoh=ENDPOINT".
     """
     flags: dict[str, Any] = {
         "grpc.port": grpc_port,
@@ -76,7 +77,8 @@ def serve(
 
 
 def _announce(server: Running) -> None:
-    typer.echo(f"listening grpc={server.grpc_address} http={server.http_address}")
+    zenoh = f" zenoh={server.zenoh_endpoint}" if server.zenoh_endpoint else ""
+    typer.echo(f"listening grpc={server.grpc_address} http={server.http_address}{zenoh}")
     sys.stdout.flush()
 
 

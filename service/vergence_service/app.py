@@ -22,7 +22,7 @@ from vergence_service.job_queue import JobQueue, QueueLimits
 from vergence_service.jobs import JobStore, StoreUnavailable
 from vergence_service.metrics import Metrics
 from vergence_service.model import OnnxStereoModel, StereoModel, packaged_weights_dir
-from vergence_service.settings import Settings
+from vergence_service.settings import Settings, ZenohSettings
 from vergence_service.streams import StreamTable
 from vergence_service.transports import ExtraMissing
 from vergence_service.transports.calls import OpenCalls
@@ -52,6 +52,7 @@ class Running:
     engine: DepthEngine
     grpc: GrpcServer
     zenoh: "ZenohServer | None"
+    zenoh_endpoint: str | None
 
 
 def make_model(settings: Settings) -> OnnxStereoModel:
@@ -131,6 +132,7 @@ async def running(
             engine,
             grpc_server,
             zenoh_server,
+            _endpoint(settings.zenoh) if zenoh_server is not None else None,
         )
 
 
@@ -153,6 +155,13 @@ async def drain(server: Running, *, within_s: float) -> None:
         tasks.create_task(server.grpc.drain(within_s=within_s))
         if server.zenoh is not None:
             tasks.create_task(server.zenoh.drain(within_s=within_s))
+
+
+def _endpoint(chosen: ZenohSettings) -> str:
+    """Where the server is to be found, in as few words as there are."""
+    if chosen.config is not None:
+        return str(chosen.config)
+    return ",".join(chosen.connect if chosen.mode == "client" else chosen.listen)
 
 
 @asynccontextmanager

@@ -40,8 +40,8 @@ EXACT = OutputFormat(encoding=PlaneEncoding.FLOAT32, sigma=True, confidence=True
 LOSSLESS = Delivery.EVERY
 
 
-async def step(session: DepthSession, frame_id: int, **make: int) -> DepthResult:
-    frame = make_frame(frame_id, **make)
+async def step(session: DepthSession, frame_id: int) -> DepthResult:
+    frame = make_frame(frame_id)
     return await session.step(frame.left, frame.right, frame.pose, capture_ns=frame.capture_ns)
 
 

@@ -1,0 +1,200 @@
+"""What the Zenoh network sees of a server: keys, encodings, answers to clients not of ours."""
+
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+from google.protobuf.message import Message
+from google.rpc import status_pb2
+
+from tests.support.frames import frame_message, make_frame, open_message
+from tests.support.models import RecallModel
+from tests.support.server import running_server
+from tests.support.zenoh_net import free_endpoint
+from vergence_proto.errors import BadShape, UnknownStream
+from vergence_proto.keys import ANY, StreamKeys, ask_key
+from vergence_proto.v1 import depth_pb2 as pb
+from vergence_proto.zenoh_inbox import Inbox
+from vergence_proto.zenoh_peer import Answer, ZenohPeer, make_config
+from vergence_service.app import Running
+from vergence_service.transports import ExtraMissing, ZenohUnreachable
+
+NAMESPACE = "vergence"
+KEYS = StreamKeys(NAMESPACE, "s")
+
+
+class Client:
+    """A client of its own making, message by message."""
+
+    def __init__(self, peer: ZenohPeer) -> None:
+        self.peer = peer
+        self.inbox = Inbox("mine", bulky=pb.DisparityMap, room=100, displaces=False)
+
+    async def ask(self, what: str, question: Message) -> Answer:
+        key = ask_key(NAMESPACE, ANY, what)
+        [answer] = await self.peer.ask(key, question, timeout_s=5, attachment_id="mine")
+        return answer
+
+    async def open(self, *, every: bool) -> None:
+        for key in (KEYS.disparity, KEYS.status):
+            await self.peer.subscribe(key, self.inbox.put)
+        answer = await self.ask("open", open_message("s", every=every).open)
+        assert answer.error is None
+
+    async def send(self, message: Message, *, attachment_id: str = "mine") -> None:
+        await self.peer.put(KEYS.frames, message, attachment_id=attachment_id)
+
+    async def send_frame(self, frame_id: int, *, attachment_id: str = "mine") -> None:
+        message = frame_message(make_frame(frame_id)).frame
+        await self.send(message, attachment_id=attachment_id)
+
+
+@asynccontextmanager
+async def served(model: RecallModel | None = None, **flags: Any) -> AsyncIterator[Client]:
+    endpoint = free_endpoint()
+    config = make_config(max_message_bytes=1 << 24, mode="client", connect__endpoints=[endpoint])
+    async with running_server(
+        model or RecallModel(), zenoh__enabled=True, zenoh__listen=[endpoint], **flags
+    ):
+        peer = ZenohPeer(config)
+        await peer.open()
+        try:
+            yield Client(peer)
+        finally:
+            await peer.close()
+
+
+async def test_messages_carry_their_type_and_the_quality_of_service_they_need() -> None:
+    samples: list[zenoh.Sample] = []
+    async with served() as client:
+        await client.peer.subscribe(KEYS.disparity, samples.append)
+        await client.open(every=False)
+        await client.send_frame(1)
+        answer = await client.inbox.take()
+    [sample] = samples
+    assert str(sample.encoding) == "application/protobuf;vergence.v1.DisparityMap"
+    assert pb.DisparityMap.FromString(sample.payload.to_bytes()) == answer
+    assert sample.priority == zenoh.Priority.REAL_TIME
+    assert sample.congestion_control == zenoh.CongestionControl.DROP
+    assert sample.express
+
+
+async def test_a_lossless_answer_waits_on_the_way_instead_of_being_dropped() -> None:
+    samples: list[zenoh.Sample] = []
+    async with served() as client:
+        await client.peer.subscribe(KEYS.disparity, samples.append)
+        await client.open(every=True)
+        await client.send_frame(1)
+        await client.inbox.take()
+    assert samples[0].congestion_control == zenoh.CongestionControl.BLOCK
+
+
+async def test_queries_are_answered_by_messages_and_refused_by_errors_of_ours() -> None:
+    async with served() as client:
+        info = await client.ask("info", pb.GetServerInfoRequest())
+        unknown = await client.ask("stream", pb.GetStreamRequest(stream_id="nobody"))
+        verb = await client.ask("dance", pb.GetServerInfoRequest())
+        opening = await client.ask("open", pb.OpenStream(stream_id="no rig"))
+        garbage = await client.ask("open", status_pb2.Status(message="\x07" * 9, code=-1))
+    assert pb.GetServerInfoResponse.FromString(info.payload).model.name == "recall"
+    assert isinstance(unknown.error, UnknownStream)
+    assert isinstance(verb.error, BadShape)
+    assert "open, info, stream, reset, close" in str(verb.error)
+    assert opening.error is not None
+    assert garbage.error is not None
+
+
+async def test_a_gap_in_the_ids_is_a_frame_that_the_network_lost() -> None:
+    async with served() as client:
+        await client.open(every=False)
+        await client.send_frame(1)
+        await client.inbox.take()
+        await client.send_frame(3)
+        lost, answer = await client.inbox.take(), await client.inbox.take()
+    assert isinstance(lost, pb.StreamDepthResponse)
+    assert list(lost.frames_dropped.frame_ids) == [2]
+    assert isinstance(answer, pb.DisparityMap)
+    assert (answer.frame_id, answer.frames_skipped) == (3, 1)
+
+
+async def test_a_pong_says_which_frames_are_still_to_be_answered() -> None:
+    model = RecallModel()
+    async with served(model) as client:
+        await client.open(every=True)
+        with model.busy():
+            await client.send_frame(1)
+            await client.send(pb.Ping(client_ns=42))
+            answer = await client.inbox.take()
+    assert isinstance(answer, pb.StreamDepthResponse)
+    assert answer.pong.client_ns == 42
+    assert list(answer.pong.unanswered_frame_ids) == [1]
+
+
+async def test_what_an_earlier_attachment_left_on_the_way_is_passed_over() -> None:
+    async with served() as client:
+        await client.open(every=True)
+        await client.send_frame(1, attachment_id="before")
+        await client.send_frame(2)
+        answer = await client.inbox.take()
+    assert isinstance(answer, pb.DisparityMap)
+    assert answer.frame_id == 2
+
+
+async def test_a_lossless_client_that_breaks_its_credit_is_ended() -> None:
+    model = RecallModel()
+    async with served(model, grpc__credit=2, grpc__waiting_frames=1) as client:
+        await client.open(every=True)
+        with model.busy():
+            for frame_id in range(1, 41):
+                await client.send_frame(frame_id)
+        answered = 0
+        while isinstance(answer := await client.inbox.take(), pb.DisparityMap):
+            answered += 1
+            assert answer.frame_id == answered
+    assert isinstance(answer, status_pb2.Status)
+    assert "credit" in answer.message
+    assert answered < 40
+
+
+async def test_a_json5_file_says_where_to_listen(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    file = tmp_path / "zenoh.json5"
+    file.write_text(
+        f"{{mode: 'router', listen: {{endpoints: ['{endpoint}']}},"
+        " scouting: {multicast: {enabled: false}}}"
+    )
+    config = make_config(max_message_bytes=1 << 20, mode="client", connect__endpoints=[endpoint])
+    async with running_server(RecallModel(), zenoh__enabled=True, zenoh__config=file):
+        peer = ZenohPeer(config)
+        await peer.open()
+        key = ask_key(NAMESPACE, ANY, "info")
+        assert len(await peer.ask(key, pb.GetServerInfoRequest(), timeout_s=5)) == 1
+        await peer.close()
+
+
+@asynccontextmanager
+async def refused(**flags: Any) -> AsyncIterator[Running]:
+    async with running_server(RecallModel(), zenoh__enabled=True, **flags) as server:
+        yield server
+
+
+async def test_what_an_operator_can_mend_is_told_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    endpoint = free_endpoint()
+    async with refused(zenoh__listen=[endpoint]):
+        with pytest.raises(ZenohUnreachable, match=r"zenoh\.listen"):
+            await refused(zenoh__listen=[endpoint]).__aenter__()
+    with pytest.raises(ZenohUnreachable, match="cannot start Zenoh"):
+        await refused(zenoh__mode="client", zenoh__connect=[free_endpoint()]).__aenter__()
+    with pytest.raises(ZenohUnreachable, match="cannot start Zenoh"):
+        await refused(zenoh__config=tmp_path / "missing.json5").__aenter__()
+    monkeypatch.delitem(sys.modules, "vergence_service.transports.zenoh_server")
+    monkeypatch.setitem(sys.modules, "zenoh", None)
+    monkeypatch.delitem(sys.modules, "vergence_proto.zenoh_peer")
+    with pytest.raises(ExtraMissing, match=r"pip install 'vergence\[zenoh\]'"):
+        await refused().__aenter__()
