@@ -2,13 +2,9 @@
 
 import asyncio
 from collections.abc import Callable
-from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
+from enum import Enum
 
 from vergence_proto.errors import (
-    BadShape,
     DepthError,
     Draining,
     FrameTooLarge,
@@ -16,23 +12,28 @@ from vergence_proto.errors import (
     NotReady,
     UnknownStream,
 )
-from vergence_proto.geometry import Pose
 from vergence_proto.model_io import ModelCard
 from vergence_proto.types import (
     Delivery,
     DisparityMap,
     Origin,
-    Plane,
     StereoFrame,
     StereoRig,
     Timings,
 )
-from vergence_service.batcher import StepBatcher, TimedResult
+from vergence_service.batcher import StepBatcher
+from vergence_service.border import Answer, view_of
 from vergence_service.continuity import ContinuityLimits
 from vergence_service.metrics import Metrics
 from vergence_service.model import Step, View, state_bytes
 from vergence_service.rectify import Rectifier
 from vergence_service.streams import Attachment, Notice, NoticeKind, Opening, Stream, StreamTable
+
+
+class _Phase(Enum):
+    LOADING = "loading"
+    SERVING = "serving"
+    DRAINING = "draining"
 
 
 class DepthEngine:
@@ -60,24 +61,22 @@ class DepthEngine:
         self._cold_iterations = cold_iterations
         self._limits = limits
         self._clock = clock
-        self._refusal: DepthError | None = NotReady(
-            "the model is loading; try again", retry_after_s=1.0
-        )
+        self._phase = _Phase.LOADING
 
     @property
     def ready(self) -> bool:
         """New streams are taken."""
-        return self._refusal is None
+        return self._phase is _Phase.SERVING
 
     async def start(self) -> None:
         """Load the model; until it is done every opening is refused with NotReady."""
         counts = {self._iterations, self._cold_iterations}
         await self._batcher.warm_up(sorted(map(self.card.iterations_at_most, counts)))
-        self._refusal = None
+        self._phase = _Phase.SERVING
 
     def drain(self, *, within_s: float) -> None:
         """Take no new stream, and tell those that are attached."""
-        self._refusal = Draining("the server is shutting down; try another one")
+        self._phase = _Phase.DRAINING
         notice = Notice(NoticeKind.DRAINING, "the server is shutting down", within_s)
         for attachment in self.streams.attachments():
             attachment.notify(notice)
@@ -96,8 +95,7 @@ class DepthEngine:
         self, stream_id: str, resume_token: bytes, opening: Opening, attachment: Attachment
     ) -> Stream:
         """Attach to a stream that is open. Raises Draining, and as StreamTable.attach."""
-        if self._refusal is not None:
-            raise self._refusal
+        self._check_serving()
         return self.streams.attach(stream_id, resume_token, opening, attachment)
 
     async def step(
@@ -180,9 +178,15 @@ class DepthEngine:
         if stream.attachment is not None:
             stream.attachment.end(UnknownStream(f"stream {stream_id!r} was closed"))
 
+    def _check_serving(self) -> None:
+        match self._phase:
+            case _Phase.LOADING:
+                raise NotReady("the model is loading; try again", retry_after_s=1.0)
+            case _Phase.DRAINING:
+                raise Draining("the server is shutting down; try another one")
+
     async def _rectifier(self, rig: StereoRig) -> Rectifier:
-        if self._refusal is not None:
-            raise self._refusal
+        self._check_serving()
         width, height = rig.left.width, rig.left.height
         if width * height > self.max_pixels:
             raise FrameTooLarge(
@@ -196,7 +200,7 @@ class DepthEngine:
         decode: Callable[[], StereoFrame],
         arrived_s: float,
         max_age_s: float | None,
-    ) -> "_Answer":
+    ) -> Answer:
         started_s = self._clock()
         skipped = stream.frames_skipped
         frame, view = await asyncio.to_thread(_decoded_view, decode, stream)
@@ -218,7 +222,7 @@ class DepthEngine:
         )
         for stage in ("decode", "queue", "model"):
             self.metrics.stage_s.labels(stage).observe(getattr(timings, f"{stage}_s"))
-        return _Answer(stream, frame.frame_id, view, timed, origin, iterations, skipped, timings)
+        return Answer(stream, frame.frame_id, view, timed, origin, iterations, skipped, timings)
 
     def _iterations_of(self, opening: Opening, *, cold: bool) -> int:
         wanted = (
@@ -229,71 +233,6 @@ class DepthEngine:
         return self.card.iterations_at_most(wanted)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Answer:
-    """A step that was taken, on its way to becoming a disparity map."""
-
-    stream: Stream
-    frame_id: int
-    view: View
-    timed: TimedResult
-    origin: Origin
-    iterations: int
-    frames_skipped: int
-    timings: Timings
-
-    def disparity_map(self) -> DisparityMap:
-        """Works on whole images, so it runs in a worker thread."""
-        result, opening = self.timed.result, self.stream.opening
-        pose = self.view.world_from_left
-        return DisparityMap(
-            frame_id=self.frame_id,
-            capture_ns=self.view.capture_ns,
-            rig=self.view.rig,
-            disparity_px=_disparity_px(result.offset_px, self.stream.rectifier),
-            sigma_px=result.sigma_px if opening.output.sigma else None,
-            confidence=_confidence(result.sigma_px) if opening.output.confidence else None,
-            world_from_left=None if pose is None else opening.axes.from_opencv(pose),
-            origin=self.origin,
-            step_count=result.state.step_count,
-            iterations=self.iterations,
-            frames_skipped=self.frames_skipped,
-            timings=self.timings,
-        )
-
-
 def _decoded_view(decode: Callable[[], StereoFrame], stream: Stream) -> tuple[StereoFrame, View]:
     frame = decode()
-    rectifier, axes = stream.rectifier, stream.opening.axes
-    height, width = frame.left.shape[:2]
-    if (width, height) != (rectifier.rig.width, rectifier.rig.height):
-        raise BadShape(
-            f"expected images of {rectifier.rig.width}x{rectifier.rig.height}, the size the "
-            f"stream was opened with, got {width}x{height}"
-        )
-    left, right = rectifier.rectify(frame.left, frame.right)
-    pose: Pose | None = None
-    if frame.pose is not None and frame.pose.orientation_valid:
-        world_from_left = axes.to_opencv(frame.pose.world_from_left)
-        pose = world_from_left @ rectifier.left_from_rectified
-    position_known = frame.pose is not None and frame.pose.position_valid
-    return frame, View(left, right, rectifier.rig, frame.capture_ns, pose, position_known)
-
-
-def _disparity_px(offset_px: Plane, rectifier: Rectifier) -> Plane:
-    """Pixel offset to disparity: NaN where it is not positive or the camera saw nothing."""
-    disparity_px = offset_px - np.float32(rectifier.rig.offset_of_zero_disparity_px)
-    there = disparity_px > 0
-    if rectifier.seen is not None:
-        there &= rectifier.seen
-    disparity_px[~there] = np.nan
-    return disparity_px
-
-
-def _confidence(sigma_px: Plane) -> NDArray[np.uint8]:
-    """The probability of an error below one pixel, times 255.
-
-    Of a Laplace distribution, whose expected absolute error is its scale.
-    """
-    probability: Plane = 1 - np.exp(-1 / np.maximum(sigma_px, np.float32(1e-6)))
-    return np.rint(probability * 255).astype(np.uint8)
+    return frame, view_of(frame, stream.rectifier, stream.opening.axes)
