@@ -7,7 +7,7 @@ from pathlib import Path
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
-from vergence_proto.errors import BadSequence, UploadTooLarge
+from vergence_proto.errors import BadSequence
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,7 +17,7 @@ class Part:
 
 
 class FormWriter:
-    """Writes each part to a file in ``folder``. Raises BadSequence, UploadTooLarge."""
+    """Writes each part to a file in ``folder``. Raises BadSequence."""
 
     def __init__(self, content_type: str, folder: Path, *, max_parts: int) -> None:
         boundary = parse_options_header(content_type)[1].get(b"boundary")
@@ -77,7 +77,7 @@ class FormWriter:
 
     def _on_headers_finished(self) -> None:
         if len(self.parts) == self._max_parts:
-            raise UploadTooLarge(f"expected at most {self._max_parts} parts in the form")
+            raise BadSequence(f"expected at most {self._max_parts} parts in the form")
         options = parse_options_header(self._headers.pop(b"content-disposition", b""))[1]
         self._headers.clear()
         path = self._folder / f"{len(self.parts):06d}"  # never by a name that the client chose

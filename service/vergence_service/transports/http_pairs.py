@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from fastapi import APIRouter, Query, Request, Response
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
+from pydantic import BaseModel, ConfigDict, Field
 
 from vergence_proto.errors import BadCalibration, BadImage, BadShape, FrameTooLarge
 from vergence_proto.geometry import RectifiedRig
@@ -46,8 +46,8 @@ class PairQuery(BaseModel):
         default=PairOutput.DISPARITY, description="depth, in metres, needs fx_px and baseline_m"
     )
     iterations: int = Field(default=0, ge=0, le=64, description="0: those of a cold start")
-    fx_px: PositiveFloat | None = None
-    baseline_m: PositiveFloat | None = None
+    fx_px: float | None = Field(default=None, ge=1, le=1e6)
+    baseline_m: float | None = Field(default=None, ge=1e-4, le=1e3)
 
 
 _FILE = {"type": "string", "format": "binary"}
@@ -59,6 +59,7 @@ _BODY: dict[str, Any] = {
                 "schema": {
                     "type": "object",
                     "required": ["left", "right"],
+                    "additionalProperties": False,
                     "properties": {"left": _FILE, "right": _FILE},
                 }
             }

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated
 
 from fastapi import Request
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveInt, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 from starlette.requests import ClientDisconnect
 
 from vergence_proto.errors import BadSequence, UploadTooLarge
@@ -46,15 +46,15 @@ class Calibration(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    width: PositiveInt
-    height: PositiveInt
-    fx: FiniteFloat
-    fy: FiniteFloat | None = None
+    width: Annotated[int, Field(ge=1, le=65535)]
+    height: Annotated[int, Field(ge=1, le=65535)]
+    fx: Annotated[FiniteFloat, Field(ge=1)]
+    fy: Annotated[FiniteFloat, Field(ge=1)] | None = None
     cx: FiniteFloat
     cy: FiniteFloat
     cx_right: FiniteFloat | None = None
-    baseline_m: FiniteFloat
-    fps: FiniteFloat | None = None
+    baseline_m: Annotated[FiniteFloat, Field(ge=1e-4)]
+    fps: Annotated[FiniteFloat, Field(gt=0)] | None = None
 
 
 class SequenceForm(BaseModel):

@@ -1,0 +1,62 @@
+"""Whatever the schema allows, and whatever it does not, is answered as the schema says."""
+
+import asyncio
+import threading
+from collections.abc import Iterator
+from contextlib import suppress
+
+import pytest
+import schemathesis
+from hypothesis import HealthCheck, given, settings
+from hypothesis.errors import Unsatisfiable
+from schemathesis import GenerationMode
+from schemathesis.openapi import from_url
+from schemathesis.specs.openapi.checks import positive_data_acceptance
+
+from tests.support.models import RecallModel
+from tests.support.server import running_server
+
+EXAMPLES = 20  # of every operation
+
+
+@pytest.fixture(scope="module")
+def api() -> Iterator[schemathesis.BaseSchema]:
+    """The schema as a running server tells it; the server runs in a thread with a loop."""
+    address: list[str] = []
+    started, stop = threading.Event(), threading.Event()
+
+    async def serve() -> None:
+        async with running_server(RecallModel(), batch__idle_s=2.0) as server:
+            address.append(server.http_address)
+            started.set()
+            await asyncio.to_thread(stop.wait)
+
+    thread = threading.Thread(target=asyncio.run, args=(serve(),))
+    thread.start()
+    assert started.wait(timeout=20)
+    try:
+        yield from_url(f"http://{address[0]}/openapi.json")
+    finally:
+        stop.set()
+        thread.join(timeout=20)
+
+
+@pytest.mark.parametrize("mode", list(GenerationMode), ids=lambda mode: mode.value)
+def test_every_operation_answers_as_the_schema_says(
+    api: schemathesis.BaseSchema, mode: GenerationMode
+) -> None:
+    checked = []
+    for operation in (each.ok() for each in api.get_all_operations()):
+
+        @given(case=operation.as_strategy(generation_mode=mode))
+        @settings(max_examples=EXAMPLES, deadline=None, suppress_health_check=list(HealthCheck))
+        def answers(case: schemathesis.Case) -> None:
+            # That bytes are a sequence, or images of one size, is more than a schema can say.
+            excluded = [positive_data_acceptance] if case.method == "POST" else []
+            case.call_and_validate(timeout=20, excluded_checks=excluded)
+
+        # Where every string is allowed and nothing else is taken, nothing can be wrong.
+        with suppress(Unsatisfiable):
+            answers()
+            checked.append(operation.label)
+    assert len(checked) >= {GenerationMode.POSITIVE: 10, GenerationMode.NEGATIVE: 3}[mode], checked
