@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from prometheus_client import CollectorRegistry
 
 from tests.support.frames import FRAME_NS, RIG, make_frame
 from tests.support.models import NOT_FINITE, RAISES, RecallModel
-from tests.support.server import running_server
+from tests.support.server import ManualClock, running_server
 from vergence_proto.errors import (
     BadPose,
     BadShape,
@@ -17,12 +18,16 @@ from vergence_proto.errors import (
     FrameOutOfOrder,
     ModelFailed,
     NonFinite,
+    NotReady,
     UnknownStream,
 )
 from vergence_proto.geometry import Axes, Pose
 from vergence_proto.types import DisparityMap, Origin, PoseSample, StereoFrame, StereoRig
+from vergence_service.batcher import StepBatcher
+from vergence_service.continuity import ContinuityLimits
 from vergence_service.engine import DepthEngine
-from vergence_service.streams import Opening
+from vergence_service.metrics import Metrics
+from vergence_service.streams import Opening, StreamTable
 
 OPENING = Opening(StereoRig.from_rectified(RIG))
 
@@ -253,3 +258,37 @@ async def test_disparity_is_stated_relative_to_the_principal_points() -> None:
         assert np.isnan(expected).any()
         assert np.isfinite(expected).any()
         np.testing.assert_array_equal(answer.disparity_px, expected)
+
+
+async def test_before_the_model_is_loaded_every_opening_is_refused() -> None:
+    model, metrics = RecallModel(), Metrics(CollectorRegistry())
+    clock = ManualClock()
+    streams = StreamTable(
+        capacity=1,
+        max_state_bytes=1 << 20,
+        idle_timeout_s=60,
+        idle_notice_s=10,
+        detach_grace_s=10,
+        clock=clock,
+        metrics=metrics,
+    )
+    async with StepBatcher(model, max_batch=1, clock=clock, metrics=metrics) as batcher:
+        engine = DepthEngine(
+            streams,
+            batcher,
+            card=model.card,
+            iterations=1,
+            cold_iterations=4,
+            limits=ContinuityLimits(max_gap_s=1, max_jump_m=1, max_jump_deg=45),
+            max_pixels=RIG.width * RIG.height,
+            clock=clock,
+            metrics=metrics,
+        )
+        with pytest.raises(NotReady, match="loading") as refusal:
+            await engine.open("a", OPENING)
+        assert refusal.value.retry_after_s is not None
+        assert not engine.ready
+        await engine.start()
+        assert engine.ready
+        await engine.open("a", OPENING)
+        assert (await step(engine, "a", make_frame(1))).origin is Origin.COLD_START
