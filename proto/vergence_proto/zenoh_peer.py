@@ -55,7 +55,7 @@ class Answer:
 
 
 def make_config(
-    file: Path | None = None, *, max_message_bytes: int, **settings: Any
+    file: Path | None = None, /, *, max_message_bytes: int, **settings: Any
 ) -> zenoh.Config:
     """A configuration from a Zenoh JSON5 file, else of our defaults; then ``settings`` by key.
 
