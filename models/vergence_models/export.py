@@ -136,9 +136,8 @@ def check_parity(network: StereoNetwork, iterations: int, path: Path, *, frames:
     worst = 0.0
     for frame in range(frames):
         left, right = shifted_pair(height, width, frame)
-        feed = dict(
-            zip([node.name for node in session.get_inputs()], [left, right, matrix, *arrays])
-        )
+        names = [node.name for node in session.get_inputs()]
+        feed = dict(zip(names, [left, right, matrix, *arrays], strict=True))
         disparity, sigma, *arrays = session.run(None, feed)
         with torch.inference_mode():
             estimate, state = network(

@@ -8,11 +8,12 @@ already matches.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 
 import torch
-import torch.nn.functional as F  # noqa: N812
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 # Comparisons of a pixel with half of its 5x5 neighbourhood: the other half would repeat them.
@@ -26,7 +27,7 @@ class CensusDescriptor(nn.Module):
     """Soft census bits of every 2x2 block of pixels: clip(difference / contrast, -1, 1).
 
     One convolution with a clip. It starts as the census transform, whose sign is softened so that
-    noise on a blank wall is no pattern, and learns from there; its filters stay blind to brightness.
+    noise on a blank wall is no pattern, and learns from there, its filters blind to brightness.
     """
 
     def __init__(self, bits: int, *, contrast: float) -> None:
@@ -41,8 +42,7 @@ class CensusDescriptor(nn.Module):
         self.contrast = contrast
 
     def forward(self, gray: Tensor, column_stride: int) -> Tensor:
-        """``gray`` [B, 1, H, W] to [B, bits, H/2, W/column_stride]; column c starts at pixel
-        c * column_stride."""
+        """``gray`` [B, 1, H, W] to [B, bits, H/2, W/column_stride]: one block every so many pixels."""
         weight = (self.weight - self.weight.mean(dim=(2, 3), keepdim=True)) * (1 / self.contrast)
         padded = F.pad(gray, (2, 3, 2, 3), mode="replicate")
         return F.conv2d(padded, weight, stride=(2, column_stride)).clamp(-1, 1)
@@ -70,6 +70,28 @@ def banded(pairs: Tensor, disparities: int) -> Tensor:
     return skewed * (d <= x * ratio).to(pairs.dtype)
 
 
+def best_rival(scores: Tensor, columns: int) -> Tensor:
+    """For each match (x, d), the best score that its right pixel has with any left pixel.
+
+    A match that scores below it is claimed by another surface: the sign of an occlusion. The way
+    back through :func:`banded`: from disparities to columns of the right image, a maximum, and a
+    gather. ``scores`` [B, H, W, D] as from :func:`banded`; the result has the same shape.
+    """
+    batch, height, width, disparities = scores.shape
+    ratio = columns // width
+    first = disparities - 1
+    x = torch.arange(width, device=scores.device)[:, None]
+    right = ratio * x - torch.arange(first, -1, -1, device=scores.device)[None, :]
+    nothing = torch.full_like(scores[:1, :1], -1e4)
+    known = torch.where(right >= 0, scores, nothing)
+    rows = F.pad(known, (0, columns + ratio - disparities), value=-1e4)
+    flat = rows.view(batch, height, width * (columns + ratio))
+    pairs = flat[..., first : first + width * columns].view(batch, height, width, columns)
+    best = pairs.amax(dim=2)
+    found = best.index_select(2, right.clamp(min=0).flatten())
+    return found.view(batch, height, width, disparities)
+
+
 def lookup(volume: Tensor, position: Tensor) -> Tensor:
     """Linear interpolation along the last axis: [B, H, W, N] at [B, H, W, K]; 0 outside.
 
@@ -87,9 +109,9 @@ def lookup(volume: Tensor, position: Tensor) -> Tensor:
 
 
 def lookup_row(volume: Tensor, position: Tensor, reach: int) -> Tensor:
-    """:func:`lookup` at position - reach .. position + reach: [B, H, W, 1] to [B, H, W, 2 reach + 1].
+    """:func:`lookup` at each ``position`` [B, H, W, 1] and at ``reach`` steps to either side of it.
 
-    Neighbouring positions share their entries, so it costs half the gathers.
+    Returns [B, H, W, 2 reach + 1]. Neighbouring positions share their entries, so it costs half the gathers.
     """
     position = position.detach()
     last = volume.shape[-1] - 1
@@ -181,12 +203,17 @@ class ConvexUpsampler(nn.Module):
             part = weights[:, 16 * quadrant : 16 * quadrant + 16]
             shares_of = [part[:, 4 * k : 4 * k + 4] for k in range(4)]
             cells = (disparity, cell(0, dx), cell(dy, 0), cell(dy, dx))
-            total = sum(share * near for share, near in zip(shares_of, cells, strict=True))
-            quadrants.append(total / sum(shares_of))
+            terms = [share * near for share, near in zip(shares_of, cells, strict=True)]
+            quadrants.append(added(terms) / added(shares_of))
         blocks = torch.cat(quadrants, dim=1).view(batch, 2, 2, 2, 2, height, width)
         # (qy, qx, ry, rx, h, w) to rows (h, qy, ry) and columns (w, qx, rx).
         ordered = blocks.permute(0, 5, 1, 3, 6, 2, 4)
         return ordered.reshape(batch, self.FACTOR * height, self.FACTOR * width)
+
+
+def added(terms: list[Tensor]) -> Tensor:
+    """Sum of tensors that broadcast; ``sum`` would start from an integer zero."""
+    return functools.reduce(torch.add, terms)
 
 
 def squash(px: Tensor, scale: float) -> Tensor:

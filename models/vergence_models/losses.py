@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F  # noqa: N812
+import torch.nn.functional as F
 from torch import Tensor
 
 from vergence_models.network import BIN_PX, Estimate
@@ -43,8 +43,12 @@ def coarse_cross_entropy(scores: Tensor, truth_px: Tensor, max_disparity_px: int
 
 
 def laplace_nll(error_px: Tensor, sigma_px: Tensor) -> Tensor:
-    """Negative log-likelihood of an error under a Laplace distribution of scale sigma."""
-    return error_px / sigma_px + torch.log(sigma_px)
+    """Negative log-likelihood of an error under a Laplace distribution of scale sigma.
+
+    An error past 20 sigma pulls no harder: one outlier must not drown a batch.
+    """
+    bounded = torch.minimum(error_px, 20 * sigma_px.detach())
+    return bounded / sigma_px + torch.log(sigma_px)
 
 
 def step_loss(estimate: Estimate, truth_px: Tensor, max_disparity_px: int) -> Tensor:

@@ -52,7 +52,7 @@ def perturbed(
     noise = torch.eye(4, dtype=torch.float64).repeat(batch, frames, 1, 1)
     zero = torch.zeros_like(rotation[..., 0])
     x, y, z = rotation.unbind(-1)
-    skew = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), dim=-1).unflatten(-1, (3, 3))
+    skew = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), dim=-1).view(batch, frames, 3, 3)
     noise[..., :3, :3] = torch.linalg.matrix_exp(skew)
     noise[..., :3, 3] = vectors() * max_m
     return world_from_left.cpu() @ noise

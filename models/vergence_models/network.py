@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F  # noqa: N812
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from vergence_models.config import NetworkConfig
@@ -19,8 +19,10 @@ from vergence_models.layers import (
     CensusDescriptor,
     ConvexUpsampler,
     GatedCell,
+    added,
     all_pairs,
     banded,
+    best_rival,
     box3,
     conv,
     lookup,
@@ -36,7 +38,7 @@ FINE_PX = 2  # spacing of the fine descriptors along the right row
 REACH = 2  # entries looked up on either side of the current disparity, coarse and fine
 TAPS = 2 * REACH + 1
 CELL_INPUTS = TAPS + 8  # what the cell sees besides the context
-MIN_PX, MIN_SIGMA_PX = 0.1, 0.02
+MIN_PX = 0.1  # no answer is nearer to infinity
 
 
 class State(NamedTuple):
@@ -97,7 +99,10 @@ def enlarge(x: Tensor) -> Tensor:
 
 
 class CostFilter(nn.Module):
-    """Coarse scores from the raw volume: box windows of three sizes, and a learned residual.
+    """Coarse scores from the raw volume.
+
+    Box windows of three sizes, a doubt about matches that another surface claims too, and a learned
+    residual.
 
     The residual is the same small network for every disparity (folded into the batch), told what
     the image looks like and where the previous frame's surface lies: what it learns at one
@@ -108,7 +113,8 @@ class CostFilter(nn.Module):
         super().__init__()
         width = config.cost_channels
         self.sharpness = nn.Parameter(torch.tensor([6.0, 8.0, 10.0]))
-        self.enter = conv(7, width, stride=2)
+        self.mutual = nn.Parameter(torch.tensor(0.3))
+        self.enter = conv(9, width, stride=2)
         self.context = conv(config.context_low, width, kernel=1)
         self.down = conv(width, width, stride=2)
         self.low = conv(width, width)
@@ -122,22 +128,35 @@ class CostFilter(nn.Module):
         middle = box3(narrow)
         wide = box3(box3(middle))
         fixed = narrow * self.sharpness[0] + middle * self.sharpness[1] + wide * self.sharpness[2]
+        lead = (fixed - fixed.amax(dim=1, keepdim=True)) * 0.1
+        rival = best_rival(fixed.permute(0, 2, 3, 1), 2 * width).permute(0, 3, 1, 2)
+        claim = (fixed - rival).clamp(max=0) * 0.1
         bin_px = torch.arange(bins - 1, -1, -1, device=volume.device).to(volume.dtype) * BIN_PX
-        near = 1 - (prior - bin_px[None, :, None, None]).abs() * (1 / (2 * BIN_PX))
+        bin_px = bin_px[None, :, None, None]
+        near = 1 - (prior - bin_px).abs() * (1 / (2 * BIN_PX))
         near = near.clamp(min=0) * (prior > 0).to(volume.dtype)
-        lead = fixed - fixed.amax(dim=1, keepdim=True)
-        lead = (lead * 0.1).clamp(min=-1)
+        u, _ = cell_centres(height, width, 8, volume)
+        in_view = (bin_px <= u).to(volume.dtype).expand_as(narrow)
         sides = F.pad(middle, (0, 0, 0, 0, 1, 1))
-        stacked = torch.stack(
-            (narrow, middle, wide, lead, near, sides[:, :-2], sides[:, 2:]), dim=2
+        channels = (
+            narrow,
+            middle,
+            wide,
+            lead.clamp(min=-1),
+            near,
+            sides[:, :-2],
+            sides[:, 2:],
+            claim.clamp(min=-1),
+            in_view,
         )
-        x = self.enter(stacked.reshape(batch * bins, 7, height, width))
+        stacked = torch.stack(channels, dim=2)
+        x = self.enter(stacked.reshape(batch * bins, len(channels), height, width))
         x = x.view(batch, bins, -1, height // 2, width // 2) + self.context(context)[:, None]
         x = F.relu(x.view(batch * bins, -1, height // 2, width // 2))
         low = F.relu(self.low(F.relu(self.down(x))))
         x = F.relu(self.middle(x + enlarge(low)))
         residual = F.pixel_shuffle(self.leave(x), 2).view(batch, bins, height, width)
-        return (fixed + residual).permute(0, 2, 3, 1)
+        return (fixed + 10 * self.mutual * claim + residual).permute(0, 2, 3, 1)
 
 
 def coarse_position(d: Tensor, bins: int) -> Tensor:
@@ -176,6 +195,18 @@ def smooth_fill(d: Tensor, confidence: Tensor) -> Tensor:
     return total[:, :1] / total[:, 1:]
 
 
+def far_fill(d: Tensor, confidence: Tensor, otherwise: Tensor) -> Tensor:
+    """The farthest surface among confident neighbours: what an occluded cell shows.
+
+    Mostly along the row; ``otherwise`` where no neighbour is confident. All [B, 1, H, W].
+    """
+    doubtful = d + 1e3 * (confidence < 0.5).to(d.dtype)
+    near = -F.max_pool2d(-doubtful, (3, 9), stride=1, padding=(1, 4))
+    wide = -F.max_pool2d(-near, (3, 9), stride=1, padding=(1, 4))
+    found = torch.where(near < 1e3, near, wide)
+    return torch.where(found < 1e3, found, otherwise)
+
+
 class CoarseUpdate(nn.Module):
     """One iteration at 1/8: look at the scores round the current disparity, choose, correct."""
 
@@ -183,7 +214,7 @@ class CoarseUpdate(nn.Module):
         super().__init__()
         self.cell = GatedCell(config.hidden, 64 - config.hidden)
         self.head = conv(config.hidden, config.hidden)
-        self.out = silent(conv(config.hidden, 4, kernel=1))
+        self.out = silent(conv(config.hidden, 5, kernel=1))
 
     def forward(
         self,
@@ -192,6 +223,7 @@ class CoarseUpdate(nn.Module):
         *,
         guess: tuple[Tensor, Tensor],
         fill: Tensor,
+        far: Tensor,
         hole: Tensor,
         scores: Tensor,
         top: Tensor,
@@ -201,8 +233,9 @@ class CoarseUpdate(nn.Module):
         guess_px, guess_log = guess
         bins = scores.shape[-1]
         around = lookup_row(scores, coarse_position(d, bins).permute(0, 2, 3, 1), REACH)
-        at_fill = lookup(scores, coarse_position(fill, bins).permute(0, 2, 3, 1))
-        log_p = torch.cat((around, at_fill), dim=-1).permute(0, 3, 1, 2)
+        fills = torch.cat((fill, far), dim=1)
+        at_fills = lookup(scores, coarse_position(fills, bins).permute(0, 2, 3, 1))
+        log_p = torch.cat((around, at_fills), dim=-1).permute(0, 3, 1, 2)
         log_p = (log_p - top).clamp(-20, 0)
         inputs = torch.cat(
             (
@@ -211,8 +244,7 @@ class CoarseUpdate(nn.Module):
                 guess_log,
                 squash(guess_px - d, 2.0),
                 squash(fill - d, 2.0),
-                squash(guess_px - fill, 2.0),
-                torch.exp(guess_log),
+                squash(far - d, 2.0),
                 hole,
                 d * (1 / 64),
             ),
@@ -221,12 +253,12 @@ class CoarseUpdate(nn.Module):
         hidden = self.cell(hidden, inputs)
         learned = self.out(F.relu(self.head(hidden)))
         # Fixed part of the choice: the score itself, and a doubt about guesses that are not unique.
-        fixed = torch.cat(
-            (log_p[:, REACH : REACH + 1] + 1, 2 * guess_log, log_p[:, -1:] - 1), dim=1
-        )
-        choice = shares(fixed + 4 * learned[:, :3], dim=1)
-        chosen = choice[:, :1] * d + choice[:, 1:2] * guess_px + choice[:, 2:] * fill
-        return hidden, (chosen + 4 * learned[:, 3:]).clamp(min=MIN_PX)
+        kept, at_fill, at_far = (log_p[:, k : k + 1] for k in (REACH, TAPS, TAPS + 1))
+        fixed = torch.cat((kept + 1, 2 * guess_log, at_fill - 1, at_far - 1), dim=1)
+        choice = shares(fixed + 4 * learned[:, :4], dim=1)
+        surfaces = torch.cat((d, guess_px, fills), dim=1)
+        chosen = (choice * surfaces).sum(dim=1, keepdim=True)
+        return hidden, (chosen + 4 * learned[:, 4:]).clamp(min=MIN_PX)
 
 
 class Refinement(nn.Module):
@@ -273,7 +305,7 @@ class Refinement(nn.Module):
         taps = lookup_row(pairs, position(d), REACH).permute(0, 3, 1, 2)
         smooth = box3(taps)
         fit = shares(self.subpixel * smooth, dim=1)
-        offset = sum(fit[:, k : k + 1] * (FINE_PX * (REACH - k)) for k in range(TAPS))
+        offset = added([fit[:, k : k + 1] * (FINE_PX * (REACH - k)) for k in range(TAPS)])
         d = d + offset
         step = carried - d
         small = (squash(step, 0.5), squash(offset, 0.5), apart, hole)
@@ -282,7 +314,8 @@ class Refinement(nn.Module):
         # The previous frame's surface is evidence too, while it agrees: half of a small step.
         keep = torch.sigmoid(4 * out[:, 1:2]) * torch.exp(-step.abs()) * (1 - hole)
         d = (d + keep * step + 2 * out[:, :1]).clamp(min=MIN_PX)
-        sigma = MIN_SIGMA_PX + F.softplus(4 * out[:, 2:])
+        # Half a pixel at first; within e^-3.5 and e^4 times that.
+        sigma = 0.5 * torch.exp((4 * out[:, 2:]).clamp(-3.5, 4))
         full = self.upsample(x, d).clamp(min=MIN_PX)
         return full, F.interpolate(sigma, scale_factor=4.0, mode="bilinear")[:, 0], d
 
@@ -318,9 +351,7 @@ class StereoNetwork(nn.Module):
         """One step. ``left`` and ``right`` uint8 [B, H, W, 3]; H and W multiples of the stride."""
         left_rows, right_rows = interleave(left), interleave(right)
         left_half, right_half = half_gray(left_rows), half_gray(right_rows)
-        fine = all_pairs(
-            self.fine_descriptor(left_half, 2), self.fine_descriptor(right_half, 1)
-        )
+        fine = all_pairs(self.fine_descriptor(left_half, 2), self.fine_descriptor(right_half, 1))
         coarse = banded(
             all_pairs(
                 self.coarse_descriptor(F.avg_pool2d(left_half, 2), 2),
@@ -340,7 +371,9 @@ class StereoNetwork(nn.Module):
         scores = self.cost_filter(coarse, context16, prior8)
         top = scores.amax(dim=-1)[:, None]
         guess = peak(scores)
-        fill = smooth_fill(guess[0], torch.exp(4 * guess[1]))
+        confidence = torch.exp(4 * guess[1])
+        fill = smooth_fill(guess[0], confidence)
+        far = far_fill(guess[0], confidence, fill)
         d = prior8 + hole8 * (fill - prior8)
         eighths = [guess[0]]
         for _ in range(iterations):
@@ -349,6 +382,7 @@ class StereoNetwork(nn.Module):
                 d,
                 guess=guess,
                 fill=fill,
+                far=far,
                 hole=hole8,
                 scores=scores,
                 top=top,

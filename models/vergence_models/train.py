@@ -1,6 +1,6 @@
 """``python -m vergence_models.train``: train one tier on pools of clips, as long as you like.
 
-    python -m vergence_models.train --config lite --pool pool/a pool/b --val pool/val --out runs/lite
+    python -m vergence_models.train --config lite --pool pool/a --val pool/val --out runs/lite
     python -m vergence_models.train ... --out runs/lite --resume --minutes 60
 
 A run can be stopped at any minute (a signal or ``--minutes``) and goes on where it was: weights,
@@ -147,7 +147,7 @@ class Trainer:
             loss = loss + step_loss(estimate, truth, self.config.network.max_disparity_px) / frames
             errors.append((estimate.disparity.detach() - truth).abs()[truth > 0].mean().item())
         self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]  # torch annotates it so
         norm = torch.nn.utils.clip_grad_norm_(network.parameters(), training.gradient_norm)
         if torch.isfinite(norm):  # one bad batch must not end a long run
             self.optimizer.step()

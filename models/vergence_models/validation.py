@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from vergence_models.data.clips import StereoClips
@@ -94,5 +95,5 @@ def save_picture(
     cv2.imwrite(str(path), np.concatenate(rows, axis=0))
 
 
-def to_bytes(share: np.ndarray[tuple[int, ...], np.dtype[np.floating]]) -> np.ndarray:
-    return (np.clip(share, 0, 1) * 255).astype(np.uint8)
+def to_bytes(share: NDArray[np.float32]) -> NDArray[np.uint8]:
+    return np.asarray(np.clip(share, 0, 1) * 255, np.uint8)

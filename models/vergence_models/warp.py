@@ -7,7 +7,7 @@ pixel centres at integers. A 4x4 matrix takes the previous frame's to the curren
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F  # noqa: N812  (the name the whole field uses)
+import torch.nn.functional as F
 from torch import Tensor
 
 MIN_DISPARITY_PX = 0.05  # smaller ones are no surface a stereo camera can place
@@ -58,8 +58,10 @@ def splat_nearest(d: Tensor, column: Tensor, row: Tensor) -> Tensor:
 
 
 def fill_cracks(d: Tensor) -> Tensor:
-    """Close the one-cell cracks that forward splatting leaves: an empty cell takes the mean of its
-    neighbours when most of them are filled. [B, H, W]."""
+    """Close the one-cell cracks that forward splatting leaves, [B, H, W].
+
+    An empty cell takes the mean of its neighbours when most of them are filled.
+    """
     filled = (d > 0).to(d.dtype)
     both = F.avg_pool2d(torch.stack((d, filled), dim=1), 3, stride=1, padding=1)
     mean = both[:, 0] / both[:, 1].clamp(min=1e-6)

@@ -1,0 +1,166 @@
+"""Exported graphs, stepped over footage: what evaluation, benchmarks and parity checks share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+from numpy.typing import NDArray
+
+from vergence_models.data.clips import StereoClips
+from vergence_proto.geometry import Pose, RectifiedRig, uvd_curr_from_prev
+from vergence_proto.layouts import LayoutError, StereoSource
+from vergence_proto.model_io import (
+    DISPARITY,
+    LEFT,
+    RIGHT,
+    SIGMA,
+    UVD_CURR_FROM_PREV,
+    ModelCard,
+    load_model_card,
+)
+
+Image = NDArray[np.uint8]
+Plane = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """One frame to step, and what is known of its truth."""
+
+    left: Image  # [H, W, 3], RGB
+    right: Image
+    world_from_left: Pose | None
+    truth_px: Plane | None = None  # [H, W], NaN unknown, mirrors left out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Footage:
+    """A rectified sequence, or a pair as a sequence of one."""
+
+    name: str
+    rig: RectifiedRig
+    views: Sequence[View]
+
+
+def footage_from_source(source: StereoSource) -> Footage:
+    """Read a whole source. Raises LayoutError: it is not rectified, or a file is wrong."""
+    rig = source.rig.as_rectified()
+    if rig is None:
+        raise LayoutError(f"{source.name}: expected a rectified rig to evaluate on")
+    views = []
+    for entry in source:
+        truth = entry.truth_px
+        if truth is not None and entry.truth_mask is not None:
+            truth = np.where(entry.truth_mask, truth, np.float32(np.nan)).astype(np.float32)
+        pose = None if entry.frame.pose is None else entry.frame.pose.world_from_left
+        views.append(View(as_rgb(entry.frame.left), as_rgb(entry.frame.right), pose, truth))
+    return Footage(source.name, rig, views)
+
+
+def as_rgb(image: Image) -> Image:
+    return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
+
+
+def footage_from_clip(clips: StereoClips, index: int, name: str) -> Footage:
+    """One clip of a batch."""
+    frames, _, height, width = clips.left.shape[1:]
+    fx, fy, cx, cy, baseline_m = (
+        float(getattr(clips, key)[index]) for key in ("fx", "fy", "cx", "cy", "baseline_m")
+    )
+    rig = RectifiedRig(width, height, fx, fy, cx, cx, cy, baseline_m)
+    views = []
+    for frame in range(frames):
+        truth = clips.disparity_px[index, frame].numpy()
+        views.append(
+            View(
+                clips.left[index, frame].permute(1, 2, 0).numpy(),
+                clips.right[index, frame].permute(1, 2, 0).numpy(),
+                Pose.from_matrix(clips.world_from_left[index, frame].numpy()),
+                np.where(truth > 0, truth, np.float32(np.nan)),
+            )
+        )
+    return Footage(name, rig, views)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    disparity_px: Plane  # [H, W]
+    sigma_px: Plane  # [H, W]
+
+
+State = tuple[Plane, ...]  # each [1, C, h, w], in the order of the card
+
+
+class OnnxNetwork:
+    """The graphs of one model under onnxruntime on the CPU."""
+
+    def __init__(self, weights: Path, name: str, *, threads: int = 2) -> None:
+        """Raises ManifestError: no such model, or a file of it is damaged."""
+        self.card: ModelCard = load_model_card(weights, name)
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads
+        options.inter_op_num_threads = 1
+        self._sessions = {
+            count: onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+            for count, path in self.card.graphs.items()
+        }
+
+    def cold_state(self, height: int, width: int, batch: int = 1) -> State:
+        """All zeros, for images of a size that the stride divides."""
+        return tuple(
+            np.zeros((batch, *tensor.shape(height, width)), np.float32)
+            for tensor in self.card.state
+        )
+
+    def run(
+        self,
+        left: Image,
+        right: Image,
+        uvd_curr_from_prev: NDArray[np.float32],
+        state: State,
+        iterations: int,
+    ) -> tuple[Plane, Plane, State]:
+        """One step of a batch: disparity, sigma [B, H, W] and the next state."""
+        feed: dict[str, NDArray[np.generic]] = {
+            LEFT: left,
+            RIGHT: right,
+            UVD_CURR_FROM_PREV: uvd_curr_from_prev,
+        }
+        for tensor, value in zip(self.card.state, state, strict=True):
+            feed[tensor.input_name] = value
+        outputs = [DISPARITY, SIGMA, *(tensor.output_name for tensor in self.card.state)]
+        disparity, sigma, *following = self._sessions[iterations].run(outputs, feed)
+        return disparity, sigma, tuple(following)
+
+    def sequence(self, footage: Footage, *, cold: int, warm: int | None) -> Iterator[Prediction]:
+        """Step through footage: ``cold`` iterations on the first frame, then ``warm``.
+
+        ``warm=None`` carries no state: every frame starts cold. No pose is no motion.
+        """
+        stride = self.card.stride
+        state: State | None = None
+        previous: Pose | None = None
+        for view in footage.views:
+            height, width = view.left.shape[:2]
+            left, right = (padded(image, stride)[None] for image in (view.left, view.right))
+            matrix = np.eye(4, dtype=np.float32)
+            if state is None or warm is None:
+                state, count = self.cold_state(*left.shape[1:3]), cold
+            else:
+                count = warm
+                if previous is not None and view.world_from_left is not None:
+                    curr_from_prev = view.world_from_left.inverse() @ previous
+                    matrix = uvd_curr_from_prev(footage.rig, curr_from_prev)
+            disparity, sigma, state = self.run(left, right, matrix[None], state, count)
+            previous = view.world_from_left
+            yield Prediction(disparity[0, :height, :width], sigma[0, :height, :width])
+
+
+def padded(image: Image, stride: int) -> Image:
+    """Grown at the right and the bottom, edges repeated: pixel coordinates stay as they are."""
+    height, width = image.shape[:2]
+    return np.pad(image, ((0, -height % stride), (0, -width % stride), (0, 0)), mode="edge")
