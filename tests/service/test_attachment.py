@@ -6,10 +6,10 @@ from dataclasses import replace
 import grpc
 import pytest
 
-from tests.service.test_bad_input import reason_of
 from tests.support.frames import RIG, frame_message, make_frame, open_message
 from tests.support.models import RecallModel
 from tests.support.server import ManualClock, RawCall, connected, raw_stream, running_server
+from tests.support.status import reason_of
 from vergence_proto.types import StereoRig
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.app import Running

@@ -9,15 +9,14 @@ import cv2
 import grpc
 import numpy as np
 import pytest
-from google.protobuf.message import Message
 from google.rpc import error_details_pb2
-from grpc_status import rpc_status
 
 from tests.support.frames import RIG, frame_message, make_frame, open_message
 from tests.support.models import NOT_FINITE, RAISES, RecallModel
 from tests.support.server import RawCall, connected, raw_stream, running_server
+from tests.support.status import reason_of, unpack_detail
 from vergence_proto import codec
-from vergence_proto.errors import ERROR_DOMAIN, ErrorCode
+from vergence_proto.errors import ErrorCode
 from vergence_proto.types import ImageEncoding, StereoRig
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.app import Running
@@ -28,23 +27,6 @@ Spoil = Callable[[pb.Frame], object]
 
 def test_every_error_code_has_a_grpc_status() -> None:
     assert set(GRPC_STATUS) == set(ErrorCode)
-
-
-def unpack_detail(error: grpc.aio.AioRpcError, detail: Message) -> None:
-    """Fill ``detail`` from the one of its kind in the error's rich status."""
-    status = rpc_status.from_call(error)  # type: ignore[arg-type] # its stubs know only sync calls
-    assert status is not None
-    assert status.message == error.details()
-    [packed] = [one for one in status.details if one.Is(detail.DESCRIPTOR)]
-    packed.Unpack(detail)
-
-
-def reason_of(error: grpc.aio.AioRpcError) -> str:
-    """The ErrorInfo reason of a failed call."""
-    info = error_details_pb2.ErrorInfo()
-    unpack_detail(error, info)
-    assert info.domain == ERROR_DOMAIN
-    return str(info.reason)
 
 
 def truncated_jpeg(frame: pb.Frame) -> None:

@@ -14,10 +14,10 @@ import httpx
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-from tests.service.test_bad_input import reason_of
 from tests.support.frames import frame_message, make_frame, open_message
 from tests.support.models import RecallModel
 from tests.support.server import RawCall, connected, raw_stream, running_server
+from tests.support.status import reason_of
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.app import drain
 from vergence_service.transports import PortTaken
