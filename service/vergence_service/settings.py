@@ -89,7 +89,7 @@ class ModelSettings(_Section):
     iterations: PositiveInt = Field(default=1, description="of a warm step")
     cold_iterations: PositiveInt = Field(default=8, description="of a cold start")
     max_batch: PositiveInt = Field(
-        default=1, description="streams stepped together; more for a GPU"
+        default=1, description="streams stepped together; a CPU takes them quicker singly"
     )
 
 
