@@ -41,8 +41,8 @@ log = logging.getLogger(__name__)
 # A sequence that was running so often when the server died is taken to be the cause.
 _MAX_ATTEMPTS = 4
 _EXPIRE_EVERY_S = 30.0
-# What a job is taken to need where none has run yet; clients are told to come back after it.
-_USUAL_JOB_S = 10.0
+# What a job is taken to need before one has run; clients are told to come back after it.
+_USUAL_JOB_S = 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,6 +83,7 @@ class JobQueue:
         self._limits = limits
         self._jobs: dict[str, Job] = {}  # as the store has them, oldest first
         self._running: tuple[str, _Running] | None = None
+        self._last_job_s = _USUAL_JOB_S
         self._uploads = 0
         self._readers: Counter[str] = Counter()  # of results, which stay until they are read
         self._tasks: list[asyncio.Task[None]] = []
@@ -222,6 +223,7 @@ class JobQueue:
             finally:
                 task.cancel()
                 await asyncio.gather(task, return_exceptions=True)
+                self._last_job_s = time.monotonic() - self._running[1].since_s
                 self._running = None
             if not task.cancelled() and task.exception():
                 return  # the server is shutting down
@@ -335,8 +337,8 @@ class JobQueue:
         if self._running is not None:
             eta_s = self.status(self._running[0]).eta_s
             if eta_s is not None:
-                return max(eta_s, 1.0)
-        return _USUAL_JOB_S
+                return eta_s
+        return self._last_job_s
 
 
 def _find(folder: Path, wanted: str | None, *, max_pixels: int) -> tuple[str, StereoSource]:

@@ -116,17 +116,17 @@ def _files(
         }
         if frame.confidence is not None:
             arrays[Output.CONFIDENCE] = frame.confidence
-        yield "{:06d}.npz", _npz(arrays)
+        yield "{:04d}.npz", _npz(arrays)
         return
     encode, extension = _ENCODERS[form]
     for name, plane in planes.items():
         if name in outputs:
-            yield f"{name}/{{:06d}}.{extension}", encode(plane())
+            yield f"{name}/{{:04d}}.{extension}", encode(plane())
     if frame.confidence is not None:
         done, file = cv2.imencode(".png", frame.confidence)
         if not done:
             raise CannotEncode("OpenCV cannot write PNG here")
-        yield f"{Output.CONFIDENCE}/{{:06d}}.png", file.tobytes()
+        yield f"{Output.CONFIDENCE}/{{:04d}}.png", file.tobytes()
 
 
 _ENCODERS: Mapping[ResultFormat, tuple[Callable[[Plane], bytes], str]] = {

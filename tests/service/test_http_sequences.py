@@ -132,14 +132,14 @@ async def test_results_come_in_every_format_and_output() -> None:
             assert json.loads(file.read("rig.json"))["baseline_m"] == RIG.baseline_m
             for name, planes in (("disparity", exact), ("depth", depths)):
                 for index, plane in enumerate(planes):
-                    content = file.read(f"{name}/{index:06d}.{extension}")
+                    content = file.read(f"{name}/{index:04d}.{extension}")
                     np.testing.assert_allclose(
                         read_back(content, extension), plane, atol=0 if form == "pfm" else 1 / 512
                     )
-            confidence = np.frombuffer(file.read("confidence/000005.png"), np.uint8)
+            confidence = np.frombuffer(file.read("confidence/0005.png"), np.uint8)
             assert np.asarray(cv2.imdecode(confidence, cv2.IMREAD_UNCHANGED)).dtype == np.uint8
     with zipfile.ZipFile(io.BytesIO(zips["npz"].content)) as file:
-        arrays = np.load(io.BytesIO(file.read("000000.npz")))
+        arrays = np.load(io.BytesIO(file.read("0000.npz")))
         np.testing.assert_array_equal(arrays["depth"], depths[0])
         assert set(arrays) == {"disparity", "depth", "confidence"}
     assert zips["mp4"].headers["Content-Type"] == "video/mp4"

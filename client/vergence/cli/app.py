@@ -2,7 +2,7 @@
 
 import sys
 
-_NEEDED = {"rich", "typer"}
+_NEEDED = {"httpx", "rich", "typer"}
 
 
 def main() -> None:

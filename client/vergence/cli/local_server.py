@@ -8,7 +8,7 @@ import sys
 import tempfile
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager, suppress
-from typing import IO
+from typing import IO, Literal
 
 from vergence.cli.trouble import Trouble
 
@@ -18,8 +18,10 @@ _STOP_TIMEOUT_S = 15.0
 
 
 @asynccontextmanager
-async def local_server(arguments: Sequence[str] = ()) -> AsyncIterator[str]:
-    """Start ``python -m vergence_service`` on free ports; yields ``grpc://HOST:PORT``.
+async def local_server(
+    arguments: Sequence[str] = (), *, scheme: Literal["grpc", "http"] = "grpc"
+) -> AsyncIterator[str]:
+    """Start ``python -m vergence_service`` on free ports; yields ``SCHEME://HOST:PORT``.
 
     Raises Trouble: it is not installed, or does not come up; with its last words.
     """
@@ -41,18 +43,18 @@ async def local_server(arguments: Sequence[str] = ()) -> AsyncIterator[str]:
             stderr=log,
         )
         try:
-            yield f"grpc://{await _address(process, log)}"
+            yield f"{scheme}://{(await _addresses(process, log))[scheme]}"
         finally:
             await _stop(process)
 
 
-async def _address(process: asyncio.subprocess.Process, log: IO[str]) -> str:
+async def _addresses(process: asyncio.subprocess.Process, log: IO[str]) -> dict[str, str]:
     assert process.stdout is not None
     try:
         async with asyncio.timeout(_START_TIMEOUT_S):
             async for line in process.stdout:
                 if ready := _READY.search(line.decode("utf-8", "replace")):
-                    return ready[1]
+                    return {"grpc": ready[1], "http": ready[2]}
     except TimeoutError:
         raise Trouble(_last_words(f"not ready within {_START_TIMEOUT_S:g} s", log)) from None
     code = await process.wait()

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Callable
+from enum import StrEnum
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated
@@ -9,6 +10,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from vergence.cli.batch import batch
 from vergence.cli.demo import bundled_sample, demo
 from vergence.cli.doctor import doctor
 from vergence.cli.run import run
@@ -27,6 +29,20 @@ app = typer.Typer(
 # imports would otherwise slow every command down, or break it where they are missing.
 _CONTRIBUTED = "vergence.commands"
 _ABOUT = {"serve": "Serve depth over gRPC, with health and metrics over HTTP."}
+
+
+class ResultForm(StrEnum):
+    PNG16 = "png16"
+    PFM = "pfm"
+    NPZ = "npz"
+    MP4 = "mp4"
+
+
+class OutputKind(StrEnum):
+    DISPARITY = "disparity"
+    DEPTH = "depth"
+    CONFIDENCE = "confidence"
+
 
 JsonOption = Annotated[
     Path | None, typer.Option("--json", help="Write the figures of the table to this file.")
@@ -114,6 +130,47 @@ def _run(
             rate=rate,
             iterations=iterations,
             pictures=pictures,
+            json=json,
+            console=Console(),
+        )
+    )
+
+
+@app.command("batch")
+def _batch(
+    paths: Annotated[
+        list[Path], typer.Argument(help="Archives, or folders in any layout that is read.")
+    ],
+    server: Annotated[
+        str | None, typer.Option(help="http://HOST:PORT of a running server; else one is started.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Results go to OUT/NAME.")] = Path("vergence-batch"),
+    form: Annotated[
+        ResultForm, typer.Option("--format", help="Of the results; mp4 is for looking at.")
+    ] = ResultForm.PNG16,
+    output: Annotated[
+        list[OutputKind], typer.Option(help="Of every frame; may be given more than once.")
+    ] = [OutputKind.DISPARITY],  # noqa: B006  typer copies it
+    iterations: Annotated[
+        int, typer.Option(min=0, help="Refinements a frame; 0: the server's default.")
+    ] = 0,
+    metrics: Annotated[
+        bool, typer.Option("--metrics", help="Compare with the truth, where it is there.")
+    ] = False,
+    json: JsonOption = None,
+) -> None:
+    """Upload sequences, let the server work through them, and collect the results."""
+    asyncio.run(
+        batch(
+            paths,
+            server=server,
+            out=out,
+            form=form,
+            query={
+                "output": [each.value for each in output],
+                "iterations": iterations,
+                "metrics": metrics,
+            },
             json=json,
             console=Console(),
         )

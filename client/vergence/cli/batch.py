@@ -1,0 +1,164 @@
+"""``vergence batch``: many sequences up, their results down."""
+
+import asyncio
+import math
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+from rich.console import Console
+from rich.progress import Progress, TaskID
+from rich.table import Table
+
+from vergence.cli.local_server import local_server
+from vergence.cli.play import progress_bar, write_json
+from vergence.cli.sequence_jobs import Job, Query, SequenceService
+from vergence.cli.trouble import Trouble
+from vergence.cli.uploads import Upload, find_uploads
+from vergence_proto.errors import DepthError
+
+# Packed and sent at once; the server runs them one after the other.
+_AT_ONCE = 3
+_CONNECT_S = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of one upload."""
+
+    name: str
+    job: Job | None  # None: it was refused
+    error: str | None = None
+
+
+async def batch(
+    paths: Sequence[Path],
+    *,
+    server: str | None,
+    out: Path,
+    form: str,
+    query: Query,
+    json: Path | None,
+    console: Console,
+) -> None:
+    """Upload every sequence at ``paths`` and write its result to OUT/NAME.
+
+    Raises Trouble: nothing to send, no server, or (at the end) some sequences failed.
+    """
+    uploads = find_uploads(list(paths))
+    if server is None:
+        async with local_server(scheme="http") as address:
+            outcomes, seconds = await _send(uploads, address, out, form, query, console)
+    else:
+        address = server if "://" in server else f"http://{server}"
+        outcomes, seconds = await _send(uploads, address, out, form, query, console)
+    console.print(f"results    {out}")
+    console.print(_table(outcomes, seconds))
+    if json is not None:
+        write_json(json, _figures(outcomes, seconds))
+    failed = [outcome for outcome in outcomes if outcome.error]
+    if failed:
+        raise Trouble(f"{len(failed)} of {len(outcomes)} sequences failed; the table says why")
+
+
+async def _send(
+    uploads: Sequence[Upload],
+    address: str,
+    out: Path,
+    form: str,
+    query: Query,
+    console: Console,
+) -> tuple[list[Outcome], float]:
+    started_s = time.monotonic()
+    # Only connecting is bounded: an upload takes as long as it takes.
+    timeout = httpx.Timeout(None, connect=_CONNECT_S)
+    with progress_bar(console) as progress, tempfile.TemporaryDirectory() as scratch:
+        async with httpx.AsyncClient(base_url=address, timeout=timeout) as http:
+            service = SequenceService(http)
+            places = asyncio.Semaphore(_AT_ONCE)
+
+            async def one(upload: Upload) -> Outcome:
+                async with places:
+                    bar = progress.add_task(upload.name, total=None, note="uploading")
+                    try:
+                        job = await _run(service, upload, Path(scratch), query, progress, bar)
+                        if job["state"] == "failed":
+                            return Outcome(upload.name, job, f"{job['reason']}: {job['message']}")
+                        await service.fetch(job, form, out / upload.name)
+                        await service.forget(job)
+                        return Outcome(upload.name, job)
+                    except DepthError as error:
+                        return Outcome(upload.name, None, f"{error.code}: {error}")
+                    finally:
+                        progress.remove_task(bar)
+
+            outcomes = await asyncio.gather(*map(one, uploads))
+    return outcomes, time.monotonic() - started_s
+
+
+async def _run(
+    service: SequenceService,
+    upload: Upload,
+    scratch: Path,
+    query: Query,
+    progress: Progress,
+    bar: TaskID,
+) -> Job:
+    """Upload and wait until the job has ended."""
+    source: Query = {} if upload.source is None else {"source": upload.source}
+    archive = await asyncio.to_thread(upload.pack, scratch)
+    job = await service.submit(archive, {**query, **source})
+    if archive != upload.path:
+        archive.unlink()
+    async for job in service.watch(job):  # noqa: B020  the last one is what is wanted
+        ahead = f"{job['ahead']} before it" if job["ahead"] else job["state"]
+        note = f"{job['fps']:.1f} fps" if job["fps"] else ahead
+        progress.update(bar, completed=job["frames_done"], total=job["frames"], note=note)
+    return job
+
+
+def _frames(outcomes: Sequence[Outcome]) -> int:
+    return sum(each.job["frames"] for each in outcomes if each.job and not each.error)
+
+
+def _figures(outcomes: Sequence[Outcome], seconds: float) -> Mapping[str, Any]:
+    frames = _frames(outcomes)
+    return {
+        "sequences": len(outcomes),
+        "failed": sum(each.error is not None for each in outcomes),
+        "frames": frames,
+        "seconds": seconds,
+        "fps": frames / seconds,
+        "results": {
+            each.name: {
+                "frames": each.job["frames"] if each.job else 0,
+                "fps": each.job["fps"] if each.job else None,
+                "accuracy": each.job["accuracy"] if each.job else None,
+                "error": each.error,
+            }
+            for each in outcomes
+        },
+    }
+
+
+def _table(outcomes: Sequence[Outcome], seconds: float) -> Table:
+    title = f"{len(outcomes)} sequences, {_frames(outcomes)} frames in {seconds:.1f} s"
+    table = Table("sequence", title=title, title_justify="left")
+    for name in ("frames", "fps", "EPE px", "D1 %"):
+        table.add_column(name, justify="right")
+    table.add_column("")
+    for each in outcomes:
+        job = each.job or {}
+        accuracy = job.get("accuracy") or {}
+        numbers = (job.get("fps"), accuracy.get("epe_px"), accuracy.get("d1_pct"))
+        table.add_row(
+            each.name,
+            str(job.get("frames", "")),
+            *(f"{value:.2f}" if value and math.isfinite(value) else "" for value in numbers),
+            each.error or "",
+        )
+    return table

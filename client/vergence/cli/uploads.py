@@ -1,0 +1,87 @@
+"""What ``vergence batch`` sends: archives as they are, folders packed into one."""
+
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from vergence.cli.trouble import Trouble
+from vergence_proto.layouts import LAYOUTS, LayoutError, find_sources
+
+_ARCHIVES = (".zip", ".tar", ".tar.gz", ".tgz", ".tar.xz", ".txz", ".tar.bz2", ".tbz2")
+_OWN_LAYOUT = "vergence"
+
+
+@dataclass(frozen=True, slots=True)
+class Upload:
+    """One sequence and where it lies."""
+
+    name: str  # of its results, unique in a batch
+    path: Path  # an archive, or a folder to pack
+    source: str | None = None  # KIND:PATH in it, where the server cannot know
+
+    def pack(self, scratch: Path) -> Path:
+        """The archive to send; images are compressed already, so it only gathers them."""
+        if self.path.is_file():
+            return self.path
+        archive = scratch / f"{self.name}.zip"
+        with zipfile.ZipFile(archive, "w") as file:
+            for each in sorted(self.path.rglob("*")):
+                if each.is_file():
+                    file.write(each, each.relative_to(self.path))
+        return archive
+
+
+def find_uploads(paths: list[Path]) -> list[Upload]:
+    """Every sequence at ``paths``: an archive, a folder of one, or a folder of many of our own.
+
+    Raises Trouble: a path that is neither, or that holds none.
+    """
+    taken: set[str] = set()
+    return [
+        Upload(_unique(upload.name, taken), upload.path, upload.source)
+        for path in paths
+        for upload in _at(path)
+    ]
+
+
+def _at(path: Path) -> Iterator[Upload]:
+    if path.is_file() and path.name.endswith(_ARCHIVES):
+        yield Upload(path.name.partition(".")[0], path)
+        return
+    if not path.is_dir():
+        raise Trouble(
+            f"{path}: expected a folder, or an archive ({' '.join(_ARCHIVES)})", exit_code=2
+        )
+    own = _found(_OWN_LAYOUT, path)
+    if own:
+        for folder in own:
+            yield Upload(folder.name or path.resolve().name, folder)
+        return
+    others = [(kind, each) for kind in LAYOUTS for each in _found(kind, path)]
+    if not others:
+        raise Trouble(f"{path}: no sequence in {', '.join(LAYOUTS)} layout", exit_code=2)
+    if len(others) > 1:
+        named = ", ".join(f"{kind}:{each}" for kind, each in others[:8])
+        raise Trouble(
+            f"{path}: more than one sequence ({named}); name folders that hold one", exit_code=2
+        )
+    kind, folder = others[0]
+    yield Upload(folder.name or path.resolve().name, path, f"{kind}:{folder.relative_to(path)}")
+
+
+def _found(kind: str, path: Path) -> list[Path]:
+    try:
+        specs = find_sources(f"{kind}:{path}")
+    except LayoutError as error:
+        raise Trouble(str(error), exit_code=2) from None
+    return [Path(spec.partition(":")[2]) for spec in specs]
+
+
+def _unique(name: str, taken: set[str]) -> str:
+    candidate, number = name, 1
+    while candidate in taken:
+        number += 1
+        candidate = f"{name}-{number}"
+    taken.add(candidate)
+    return candidate
