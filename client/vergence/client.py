@@ -3,18 +3,15 @@
 import re
 import uuid
 from collections.abc import Callable
-from functools import partial
 from typing import Self
 
 from vergence.info import ServerInfo, StreamInfo
 from vergence.results import SessionEvent
 from vergence.session import DepthSession
-from vergence.transports.base import Transport
-from vergence.transports.grpc import GrpcTransport
+from vergence.transports.addresses import connector
 from vergence_proto import codec
 from vergence_proto.errors import BadShape
 from vergence_proto.geometry import Axes, RectifiedRig
-from vergence_proto.keys import DEFAULT_NAMESPACE
 from vergence_proto.types import Delivery, ImageEncoding, OutputFormat, StereoRig
 from vergence_proto.v1 import depth_pb2 as pb
 
@@ -26,14 +23,15 @@ _STREAM_ID = re.compile(r"[A-Za-z0-9._-]{1,128}")
 class DepthClient:
     """A connection to a server; connects when it is first needed.
 
-    ``server`` is ``grpc://HOST:PORT``; anything else is a ValueError. Every method raises NotReady
-    (ConnectionLost) where the server cannot be reached, and otherwise the class of
-    :mod:`vergence_proto.errors` that the server raised. Use it inside ``async with``, from one
-    event loop.
+    ``server`` is ``grpc://HOST:PORT``, or ``zenoh://HOST:PORT[/NAMESPACE][?config=FILE]`` with the
+    place of a Zenoh router, of which a server can be one; anything else is a ValueError. Every
+    method raises NotReady (ConnectionLost) where the server cannot be reached, and otherwise the
+    class of :mod:`vergence_proto.errors` that the server raised. Use it inside ``async with``, from
+    one event loop.
     """
 
     def __init__(self, server: str = DEFAULT_SERVER) -> None:
-        self._connect = _connector(server)
+        self._connect = connector(server)
 
     async def __aenter__(self) -> Self:
         self._transport = self._connect()
@@ -118,33 +116,6 @@ class DepthClient:
         """End a stream, whoever holds it, and free its state. Raises UnknownStream."""
         request = pb.CloseStreamRequest(stream_id=stream_id)
         await self._transport.ask("CloseStream", request, pb.CloseStreamResponse)
-
-
-def _connector(server: str) -> Callable[[], Transport]:
-    """What makes the transport to ``server``, to be called in the event loop it will live in."""
-    scheme, separator, address = server.rpartition("://")
-    host, _, port = address.rpartition(":")
-    if scheme == ("grpc" if separator else "") and host and port.isdecimal():
-        return partial(GrpcTransport, address)
-    if scheme == "zenoh":
-        return _zenoh_connector(address)
-    raise ValueError(
-        f"expected a server as grpc://HOST:PORT or zenoh://HOST:PORT[/NAMESPACE], got {server!r}"
-    )
-
-
-def _zenoh_connector(address: str) -> Callable[[], Transport]:
-    place, _, namespace = address.partition("/")
-    host, _, port = place.rpartition(":")
-    if not (host and port.isdecimal()):
-        raise ValueError(f"expected a server as zenoh://HOST:PORT[/NAMESPACE], got {address!r}")
-    try:
-        from vergence.transports.zenoh import ZenohTransport
-    except ImportError:
-        raise ValueError(
-            "a zenoh:// server needs Zenoh; install it: pip install 'vergence[zenoh]'"
-        ) from None
-    return partial(ZenohTransport, f"tcp/{place}", namespace or DEFAULT_NAMESPACE)
 
 
 def _checked_id(stream_id: str) -> str:

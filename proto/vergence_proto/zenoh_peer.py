@@ -78,6 +78,7 @@ class ZenohPeer:
 
     def __init__(self, config: zenoh.Config) -> None:
         self._config = config
+        self._closed = False
         self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="zenoh")
 
     async def open(self) -> None:
@@ -92,6 +93,7 @@ class ZenohPeer:
     async def close(self) -> None:
         # Without it the interpreter hangs on its way out.
         await self._in_thread(self._session.close)
+        self._closed = True
         self._threads.shutdown(wait=False)
 
     async def put(
@@ -187,14 +189,19 @@ class ZenohPeer:
         )
 
     async def undeclare(self, *declared: Undeclarable) -> None:
+        if self._closed:
+            return  # and they are gone with it
+
         def undeclare() -> None:
             for each in declared:
-                with suppress(zenoh.ZError):  # the session is closed, and they are gone with it
+                with suppress(zenoh.ZError):  # the session closes meanwhile
                     each.undeclare()
 
         await self._in_thread(undeclare)
 
     async def _in_thread(self, call: Callable[[], Value]) -> Value:
+        if self._closed:
+            raise zenoh.ZError("the session is closed")
         return await asyncio.get_running_loop().run_in_executor(self._threads, call)
 
     def _to_loop(self, function: Callable[..., None]) -> Callable[..., None]:

@@ -33,6 +33,7 @@ from vergence import (
     StreamLimit,
     Superseded,
     UnknownStream,
+    depth,
 )
 from vergence_service.app import Running, drain
 
@@ -198,12 +199,14 @@ async def test_what_the_network_loses_is_found_out_and_gives_its_credit_back(way
         DepthClient(between.address) as client,
         client.open_session(RIG) as session,
     ):
+        stream = server.engine.streams.get(session.stream_id)
         for frame_id in range(1, 1 + session.credit):
             assert submit(session, frame_id) == frame_id
+            if way == "disparity":
+                await eventually(lambda: stream.frames_stepped == frame_id)  # noqa: B023 -- awaited here
         await eventually(lambda: session.drops.displaced == session.credit)
         assert submit(session, 9) is not None
-        stepped = server.engine.streams.get(session.stream_id).frames_stepped
-        assert stepped == (0 if way == "frames" else session.credit)
+        assert stream.frames_stepped == (0 if way == "frames" else session.credit)
 
 
 async def test_a_dead_headset_is_noticed_and_its_stream_waits_for_the_next() -> None:
@@ -333,6 +336,30 @@ async def test_a_server_that_shuts_down_says_so() -> None:
             await anext(session)
         await draining
     assert [event.kind for event in events] == [EventKind.DRAINING]
+
+
+async def test_a_server_that_falls_silent_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vergence.transports.zenoh_call._PONG_PATIENCE_S", 0.5)
+    events: list[SessionEvent] = []
+    # Tokens and queries pass the router, and nothing else.
+    async with (
+        router(low_pass_filter=[only("put", "vergence/v1/*/status", 0)]) as between,
+        server_on(between.endpoint),
+        DepthClient(between.address) as client,
+        client.open_session(RIG, on_event=events.append),
+    ):
+        await eventually(lambda: len(events) == 2)
+        assert [event.kind for event in events] == [EventKind.DISCONNECTED, EventKind.RESUMED]
+    assert "has not answered" in events[0].message
+
+
+def test_the_blocking_facade_takes_the_same_addresses() -> None:
+    async def serve_and_ask() -> DepthResult:
+        async with lone_server() as (_, address):
+            frame = make_frame(1)
+            return await asyncio.to_thread(depth, frame.left, frame.right, RIG, server=address)
+
+    assert asyncio.run(serve_and_ask()).step_count == 1
 
 
 async def test_without_a_server_the_client_says_what_it_looked_for() -> None:

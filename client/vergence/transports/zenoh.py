@@ -14,8 +14,8 @@ from vergence_proto.keys import ANY, UNARY_KEYS, ask_key
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.zenoh_peer import ZenohPeer, make_config
 
-_ASK_TIMEOUT_S = 2.0  # a server that has not answered by then is as good as none
-_CONNECT_TIMEOUT_MS = 2000
+_ASK_TIMEOUT_S = 1.5  # a server that has not answered by then is as good as none
+_CONNECT_TIMEOUT_MS = 1000
 _MAX_MESSAGE_BYTES = 64 << 20  # of what comes: far above the largest map
 
 
@@ -31,6 +31,7 @@ class ZenohTransport:
         self._namespace = namespace
         self._config = config
         self._peer: ZenohPeer | None = None
+        self._closed = False
         self._turn = asyncio.Lock()
         self._calls: dict[str, ZenohCall] = {}  # by stream, the latest of each that is not over
 
@@ -54,12 +55,15 @@ class ZenohTransport:
         for call in self._calls.values():
             call.lose(f"the connection to {self._endpoint} was closed")
         async with self._turn:
+            self._closed = True
             peer, self._peer = self._peer, None
             if peer is not None:
                 await peer.close()
 
     async def _connected(self) -> ZenohPeer:
         async with self._turn:
+            if self._closed:
+                raise RuntimeError("the client was closed")
             if self._peer is None:
                 config = make_config(
                     self._config,
@@ -82,19 +86,24 @@ class ZenohTransport:
         ``home`` is the server that had it, if it is to be resumed. Raises ConnectionLost: no
         server answers, or not that one.
         """
-        infos = await self._ask_all(
-            "GetServerInfo", pb.GetServerInfoRequest(), pb.GetServerInfoResponse
+        question = pb.GetStreamRequest(stream_id=stream_id)
+        # Both at once: a server that hangs is waited for, and an opening has not long.
+        infos, holders = await asyncio.gather(
+            self._ask_all("GetServerInfo", pb.GetServerInfoRequest(), pb.GetServerInfoResponse),
+            self._holders(question),
         )
         if home and home not in infos:
             raise ConnectionLost(f"the server of stream {stream_id!r} is not on the network")
-        try:
-            question = pb.GetStreamRequest(stream_id=stream_id)
-            holders = await self._ask_all("GetStream", question, pb.GetStreamResponse)
-        except (UnknownStream, StreamExpired):
-            ids = [home] if home else sorted(infos, key=lambda each: _load(infos[each]))
-        else:
-            ids = [each for each in holders if each in infos]
+        known = [each for each in holders if each in infos] or [home] * bool(home)
+        ids = known or sorted(infos, key=lambda each: _load(infos[each]))
         return {each: infos[each] for each in ids}
+
+    async def _holders(self, question: pb.GetStreamRequest) -> list[str]:
+        """Ids of the servers, one at most, that have the stream."""
+        try:
+            return list(await self._ask_all("GetStream", question, pb.GetStreamResponse))
+        except (UnknownStream, StreamExpired):
+            return []
 
     async def _ask_all(
         self, method: str, question: Message, kind: type[Answer]

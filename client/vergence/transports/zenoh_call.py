@@ -3,7 +3,6 @@
 import secrets
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterable
-from contextlib import suppress
 
 import zenoh
 from google.protobuf.message import Message
@@ -29,6 +28,8 @@ from vergence_proto.zenoh_peer import Undeclarable, ZenohPeer
 ServerInfos = dict[str, pb.GetServerInfoResponse]  # by server id, best first
 
 _OPEN_TIMEOUT_S = 5.0
+# A way that is open at one end only, or a server that hangs: no token tells of either.
+_PONG_PATIENCE_S = 5.0
 # No more maps are on the way than the server gives credit; past this the oldest would give way.
 _WAITING_MAPS = 16
 # The server would take the stream, had it room: another may have.
@@ -77,8 +78,7 @@ class ZenohCall:
                 case "frame":
                     await self._send_frame(request.frame)
                 case "ping":
-                    self._sent_before[request.ping.client_ns] = max(self._unanswered, default=0)
-                    await self._put(request.ping, may_drop=self._live)
+                    await self._send_ping(request.ping)
                 case "reset":
                     await self._put(request.reset)
                 case "end":
@@ -109,8 +109,7 @@ class ZenohCall:
 
     async def close(self) -> None:
         self.lose("the call was closed")
-        with suppress(RuntimeError):  # the session is closed, and all is gone with it
-            await self._peer.undeclare(*self._declared)
+        await self._peer.undeclare(*self._declared)
 
     def lose(self, why: str) -> None:
         """End the call, for a session to resume it."""
@@ -162,6 +161,13 @@ class ZenohCall:
         self._unanswered[frame.frame_id] = None
         await self._put(frame, may_drop=self._live)
 
+    async def _send_ping(self, ping: pb.Ping) -> None:
+        waited_ns = ping.client_ns - min(self._sent_before, default=ping.client_ns)
+        if waited_ns > _PONG_PATIENCE_S * 1e9:
+            self.lose(f"server {self.server_id} has not answered for {waited_ns * 1e-9:.0f} s")
+        self._sent_before[ping.client_ns] = max(self._unanswered, default=0)
+        await self._put(ping, may_drop=self._live)
+
     async def _put(self, message: Message, *, may_drop: bool = False) -> None:
         await self._peer.put(
             self._keys.frames, message, attachment_id=self._attachment_id, may_drop=may_drop
@@ -180,7 +186,10 @@ class ZenohCall:
                 for frame_id in message.frames_dropped.frame_ids:
                     self._unanswered.pop(frame_id, None)
             case "pong":
-                last = self._sent_before.pop(message.pong.client_ns, 0)
+                last = self._sent_before.get(message.pong.client_ns, 0)
+                # Pings before this one were lost, or their pongs were.
+                for client_ns in [ns for ns in self._sent_before if ns <= message.pong.client_ns]:
+                    del self._sent_before[client_ns]
                 waiting = set(message.pong.unanswered_frame_ids)
                 self._tell_lost(
                     frame_id

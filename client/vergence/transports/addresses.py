@@ -1,0 +1,53 @@
+"""From the address of a server to what makes the transport to it."""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
+
+from vergence.transports.base import Transport
+from vergence.transports.grpc import GrpcTransport
+from vergence_proto.keys import DEFAULT_NAMESPACE
+
+_EXPECTED = (
+    "expected a server as grpc://HOST:PORT or zenoh://HOST:PORT[/NAMESPACE][?config=FILE], got {!r}"
+)
+
+
+def connector(server: str) -> Callable[[], Transport]:
+    """What makes the transport to ``server``, to be called in the event loop it will live in.
+
+    ``zenoh+tls://`` and the like name the link, which is TCP otherwise. Raises ValueError.
+    """
+    scheme, separator, address = server.rpartition("://")
+    if scheme == ("grpc" if separator else "") and _is_place(address):
+        return partial(GrpcTransport, address)
+    kind, _, link = scheme.partition("+")
+    if kind == "zenoh":
+        return _zenoh_connector(server, link or "tcp")
+    raise ValueError(_EXPECTED.format(server))
+
+
+def _zenoh_connector(server: str, link: str) -> Callable[[], Transport]:
+    parts = urlsplit(server)
+    options = parse_qs(parts.query, keep_blank_values=True)
+    files = options.pop("config", [])
+    if not _is_place(parts.netloc) or options or len(files) > 1:
+        raise ValueError(_EXPECTED.format(server))
+    try:
+        from vergence.transports.zenoh import ZenohTransport
+    except ImportError:
+        raise ValueError(
+            f"{server} needs Zenoh, which is not installed here: pip install 'vergence[zenoh]'"
+        ) from None
+    return partial(
+        ZenohTransport,
+        f"{link}/{parts.netloc}",
+        parts.path.strip("/") or DEFAULT_NAMESPACE,
+        Path(files[0]) if files else None,
+    )
+
+
+def _is_place(address: str) -> bool:
+    host, _, port = address.rpartition(":")
+    return bool(host) and port.isdecimal()
