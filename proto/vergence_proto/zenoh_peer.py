@@ -73,6 +73,11 @@ def make_config(
     return config
 
 
+def reason_of(error: zenoh.ZError) -> str:
+    """What Zenoh says, without the place in its own source."""
+    return str(error).partition(" at /")[0]
+
+
 class ZenohPeer:
     """A session from :meth:`open` to :meth:`close`. Methods raise zenoh.ZError."""
 

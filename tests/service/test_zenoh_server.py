@@ -14,7 +14,8 @@ from google.rpc import status_pb2
 from tests.support.frames import frame_message, make_frame, open_message
 from tests.support.models import RecallModel
 from tests.support.server import running_server
-from tests.support.zenoh_net import free_endpoint
+from tests.support.zenoh_net import address_of, free_endpoint
+from vergence import ConnectionLost, DepthClient
 from vergence_proto.errors import BadShape, UnknownStream
 from vergence_proto.keys import ANY, StreamKeys, ask_key
 from vergence_proto.v1 import depth_pb2 as pb
@@ -174,6 +175,35 @@ async def test_a_json5_file_says_where_to_listen(tmp_path: Path) -> None:
         key = ask_key(NAMESPACE, ANY, "info")
         assert len(await peer.ask(key, pb.GetServerInfoRequest(), timeout_s=5)) == 1
         await peer.close()
+
+
+async def test_who_may_come_in_is_for_the_file_to_say(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    users = tmp_path / "users.txt"
+    users.write_text("headset:secret\n")
+    file = tmp_path / "server.json5"
+    file.write_text(
+        f"{{mode: 'router', listen: {{endpoints: ['{endpoint}']}},"
+        f" transport: {{auth: {{usrpwd: {{dictionary_file: '{users}'}}}}}}}}"
+    )
+    async with running_server(RecallModel(), zenoh__enabled=True, zenoh__config=file):
+        for password, comes_in in (("secret", True), ("wrong", False)):
+            user = tmp_path / f"{password}.json5"
+            user.write_text(
+                f"{{transport: {{auth: {{usrpwd: {{user: 'headset', password: '{password}'}}}}}}}}"
+            )
+            async with DepthClient(f"{address_of(endpoint)}?config={user}") as client:
+                if comes_in:
+                    assert (await client.server_info()).model.name == "recall"
+                else:
+                    with pytest.raises(ConnectionLost):
+                        await client.server_info()
+
+
+def test_the_router_that_we_recommend_is_one() -> None:
+    file = Path(__file__).parents[2] / "docker" / "zenoh.json5"
+    config = make_config(file, max_message_bytes=1 << 20)
+    assert config.get_json("mode") == '"router"'
 
 
 @asynccontextmanager

@@ -12,7 +12,7 @@ from vergence.transports.zenoh_call import ServerInfos, ZenohCall
 from vergence_proto.errors import DepthError, StreamExpired, UnknownStream
 from vergence_proto.keys import ANY, UNARY_KEYS, ask_key
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_proto.zenoh_peer import ZenohPeer, make_config
+from vergence_proto.zenoh_peer import ZenohPeer, make_config, reason_of
 
 _ASK_TIMEOUT_S = 1.5  # a server that has not answered by then is as good as none
 _CONNECT_TIMEOUT_MS = 1000
@@ -71,14 +71,18 @@ class ZenohTransport:
                     mode="client",
                     connect__endpoints=[self._endpoint],
                     connect__timeout_ms=_CONNECT_TIMEOUT_MS,
+                    scouting__multicast__enabled=False,  # whatever the file says of it
                 )
                 peer = ZenohPeer(config)
                 try:
                     await peer.open()
                 except zenoh.ZError as error:
-                    raise ConnectionLost(f"no connection to {self._endpoint}: {error}") from None
+                    raise self._lost(error) from None
                 self._peer = peer
             return self._peer
+
+    def _lost(self, error: zenoh.ZError) -> ConnectionLost:
+        return ConnectionLost(f"no connection to {self._endpoint}: {reason_of(error)}")
 
     async def _servers_for(self, stream_id: str, *, home: str) -> ServerInfos:
         """Where to open a stream, best first: the server that has it, else by load.
@@ -117,7 +121,7 @@ class ZenohTransport:
         try:
             answers = await peer.ask(key, question, timeout_s=_ASK_TIMEOUT_S)
         except zenoh.ZError as error:
-            raise ConnectionLost(f"no connection to {self._endpoint}: {error}") from None
+            raise self._lost(error) from None
         refusals = [each.error for each in answers if each.error is not None]
         if known := [each for each in answers if each.error is None]:
             return {each.server_id: kind.FromString(each.payload) for each in known}

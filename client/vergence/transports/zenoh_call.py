@@ -23,7 +23,7 @@ from vergence_proto.errors import (
 from vergence_proto.keys import ANY, OPEN, StreamKeys, ask_key, server_key
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.zenoh_inbox import Inbox
-from vergence_proto.zenoh_peer import Undeclarable, ZenohPeer
+from vergence_proto.zenoh_peer import Undeclarable, ZenohPeer, reason_of
 
 ServerInfos = dict[str, pb.GetServerInfoResponse]  # by server id, best first
 
@@ -84,7 +84,7 @@ class ZenohCall:
                 case "end":
                     await self._put(request.end)
         except zenoh.ZError as error:
-            self.lose(str(error))
+            self.lose(reason_of(error))
         except DepthError as error:
             self._inbox.end(error)
 

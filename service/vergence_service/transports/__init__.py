@@ -23,7 +23,7 @@ class ExtraMissing(ImportError):
 class ZenohUnreachable(OSError):
     """The Zenoh network cannot be joined as the settings say."""
 
-    def __init__(self, reason: object) -> None:
+    def __init__(self, reason: str) -> None:
         super().__init__(
             f"cannot start Zenoh: {reason}; look at zenoh.listen, zenoh.connect and zenoh.config"
         )

@@ -12,7 +12,7 @@ from google.protobuf.message import DecodeError, Message
 from vergence_proto.errors import BadShape
 from vergence_proto.keys import ANY, OPEN, StreamKeys, ask_key, server_key
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_proto.zenoh_peer import ZenohPeer, make_config
+from vergence_proto.zenoh_peer import ZenohPeer, make_config, reason_of
 from vergence_service.transports import ZenohUnreachable
 from vergence_service.transports.calls import OpenCalls
 from vergence_service.transports.unary import UnaryMethods
@@ -48,7 +48,7 @@ def zenoh_config(
             connect__endpoints=list(connect),
         )
     except zenoh.ZError as error:
-        raise ZenohUnreachable(error) from None
+        raise ZenohUnreachable(reason_of(error)) from None
 
 
 class ZenohServer:
@@ -76,7 +76,7 @@ class ZenohServer:
         try:
             await self._peer.open()
         except zenoh.ZError as error:
-            raise ZenohUnreachable(error) from None
+            raise ZenohUnreachable(reason_of(error)) from None
         return self
 
     async def __aexit__(self, *exc_info: object) -> None:
