@@ -34,6 +34,7 @@ _DEFAULTS: dict[str, Any] = {
     # Nobody is found by chance: endpoints are named.
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
+    "scouting/delay": 0,  # for those that are found
     # A node that vanished without a word is noticed after this, not after ten seconds.
     "transport/link/tx/lease": 5000,
     # Zenoh waits seconds between attempts, and a stream has only the server's grace to come back.

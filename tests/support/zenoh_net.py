@@ -63,10 +63,14 @@ async def router(**settings: Any) -> AsyncIterator[Router]:
 
 def _main(endpoint: str, settings: str) -> None:
     config = zenoh.Config()
-    config.insert_json5("mode", '"router"')
-    config.insert_json5("listen/endpoints", json.dumps([endpoint]))
-    config.insert_json5("scouting/multicast/enabled", "false")
-    for key, value in json.loads(settings).items():
+    values = {
+        "mode": "router",
+        "listen__endpoints": [endpoint],
+        "scouting__multicast__enabled": False,
+        "scouting__delay": 0,
+        **json.loads(settings),
+    }
+    for key, value in values.items():
         config.insert_json5(key.replace("__", "/"), json.dumps(value))
     with zenoh.open(config):
         print("ready", flush=True)  # noqa: T201 -- to the test that started it
