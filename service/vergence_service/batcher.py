@@ -4,14 +4,20 @@ import asyncio
 import logging
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Self
 
 from vergence_proto.errors import DepthError, Draining, FrameStale, ModelFailed
 from vergence_service.metrics import Metrics
 from vergence_service.model import Step, StepResult, StereoModel
+from vergence_service.rhythm import LiveRhythm
 
 log = logging.getLogger(__name__)
+
+# A step that gives way to live ones does so for no longer: a batch goes on, if slowly, beside
+# streams that leave no gap, and one live frame in thirty is late for it.
+_PATIENCE_S = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,7 +44,8 @@ class _Waiting:
 class StepBatcher:
     """Gathers the steps that wait for the model and runs them together, oldest first.
 
-    Live steps come before all others, which fill the gaps that they leave, in batches of their own.
+    Live steps come before all others, which fill the gaps that they leave, in batches of their
+    own: one that would be in the way of the next live frame is held back, but not for ever.
     Every waiter gets a result or an exception: ModelFailed, NonFinite, FrameStale, or Draining
     when the batcher ends first. A caller never has two steps of one stream waiting.
     """
@@ -57,6 +64,8 @@ class StepBatcher:
         self._metrics = metrics
         self._waiting: list[_Waiting] = []
         self._arrived = asyncio.Event()
+        self._rhythm = LiveRhythm()
+        self._work_s: dict[tuple[object, ...], float] = {}  # how long each shape of work took
 
     async def __aenter__(self) -> Self:
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="model")
@@ -76,11 +85,18 @@ class StepBatcher:
         await loop.run_in_executor(self._thread, self._model.warm_up, iterations)
 
     async def step(
-        self, step: Step, *, deadline_s: float | None = None, live: bool = True
+        self, step: Step, *, deadline_s: float | None = None, live_stream: str | None = None
     ) -> TimedResult:
-        """The result of one step; FrameStale if the model was not free before ``deadline_s``."""
+        """The result of one step; FrameStale if the model was not free before ``deadline_s``.
+
+        ``live_stream`` is the stream that it is of, None for a step that gives way to live ones.
+        """
+        now_s = self._clock()
         answer: asyncio.Future[TimedResult] = asyncio.get_running_loop().create_future()
-        self._waiting.append(_Waiting(step, self._clock(), deadline_s, live, answer))
+        live = live_stream is not None
+        self._waiting.append(_Waiting(step, now_s, deadline_s, live, answer))
+        if live_stream is not None:
+            self._rhythm.arrived(live_stream, now_s)
         self._arrived.set()
         return await answer
 
@@ -90,10 +106,29 @@ class StepBatcher:
             while True:
                 await self._arrived.wait()
                 batch = self._next_batch()
-                if batch:
+                if batch and (hold_s := self._hold_s(batch[0])) > 0:
+                    self._waiting = batch + self._waiting
+                    batch = []
+                    await self._next_arrival(within_s=hold_s)
+                elif batch:
                     await self._step_together(batch)
         finally:
             self._waiting += batch  # those without an answer get one from __aexit__
+
+    def _hold_s(self, first: _Waiting) -> float:
+        """How long the work of ``first`` is to stay out of the way of a live frame."""
+        now_s = self._clock()
+        due = None if first.live else self._rhythm.next_due(now_s)
+        if due is None or now_s - first.since_s > _PATIENCE_S:
+            return 0.0
+        ends_s = now_s + self._work_s.get(first.shape_of_work, 0.0)
+        return due.until_s - now_s if ends_s > due.at_s else 0.0
+
+    async def _next_arrival(self, *, within_s: float) -> None:
+        self._arrived.clear()
+        with suppress(TimeoutError):
+            await asyncio.wait_for(self._arrived.wait(), within_s)
+        self._arrived.set()
 
     def _next_batch(self) -> list[_Waiting]:
         now_s = self._clock()
@@ -129,6 +164,7 @@ class StepBatcher:
                 await self._step_together([item])
             return
         model_s = self._clock() - started_s
+        self._work_s[batch[0].shape_of_work] = model_s
         self._metrics.batch_size.observe(len(batch))
         for item, result in zip(batch, results, strict=True):
             if not item.answer.done():

@@ -211,7 +211,7 @@ class DepthEngine:
         timed = await self._batcher.step(
             Step(view, state, iterations),
             deadline_s=None if max_age_s is None else arrived_s + max_age_s,
-            live=stream.opening.delivery is Delivery.NEWEST,
+            live_stream=stream.stream_id if stream.opening.delivery is Delivery.NEWEST else None,
         )
         stream.commit(frame.frame_id, timed.result.state, frames_skipped=skipped)
         self.metrics.frames_stepped.labels(origin.name.lower()).inc()
