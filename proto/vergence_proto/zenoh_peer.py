@@ -23,7 +23,6 @@ from vergence_proto import codec
 from vergence_proto.errors import DepthError, ModelFailed
 from vergence_proto.keys import encoding_of, server_of
 
-Item = TypeVar("Item")
 Value = TypeVar("Value")
 
 # A lossless message that waits for a slow receiver holds a thread; these are not the event loop's
@@ -37,6 +36,9 @@ _DEFAULTS: dict[str, Any] = {
     "scouting/delay": 0,  # for those that are found
     # A node that vanished without a word is noticed after this, not after ten seconds.
     "transport/link/tx/lease": 5000,
+    # A raw pair takes longer than the default of 50 ms to leave over Wi-Fi, and every one would be
+    # dropped; credit bounds how many wait. In microseconds.
+    "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": 500_000,
     # Zenoh waits seconds between attempts, and a stream has only the server's grace to come back.
     "connect/retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 2},
 }

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import zenoh
 from google.protobuf.message import Message
+from google.protobuf.wrappers_pb2 import BytesValue
 from google.rpc import status_pb2
 
 from tests.support.frames import frame_message, make_frame, open_message
@@ -100,13 +101,16 @@ async def test_queries_are_answered_by_messages_and_refused_by_errors_of_ours() 
         unknown = await client.ask("stream", pb.GetStreamRequest(stream_id="nobody"))
         verb = await client.ask("dance", pb.GetServerInfoRequest())
         opening = await client.ask("open", pb.OpenStream(stream_id="no rig"))
-        garbage = await client.ask("open", status_pb2.Status(message="\x07" * 9, code=-1))
+        garbage = await client.ask("open", BytesValue(value=b"\xff"))
+        key = ask_key(NAMESPACE, ANY, "open")
+        [nameless] = await client.peer.ask(key, open_message("s").open, timeout_s=5)
     assert pb.GetServerInfoResponse.FromString(info.payload).model.name == "recall"
     assert isinstance(unknown.error, UnknownStream)
     assert isinstance(verb.error, BadShape)
     assert "open, info, stream, reset, close" in str(verb.error)
     assert opening.error is not None
-    assert garbage.error is not None
+    assert isinstance(garbage.error, BadShape)
+    assert "attachment id" in str(nameless.error)
 
 
 async def test_a_gap_in_the_ids_is_a_frame_that_the_network_lost() -> None:

@@ -27,7 +27,7 @@ from vergence_proto.zenoh_peer import Undeclarable, ZenohPeer, reason_of
 
 ServerInfos = dict[str, pb.GetServerInfoResponse]  # by server id, best first
 
-_OPEN_TIMEOUT_S = 5.0
+_OPEN_TIMEOUT_S = 3.0
 # A way that is open at one end only, or a server that hangs: no token tells of either.
 _PONG_PATIENCE_S = 5.0
 # No more maps are on the way than the server gives credit; past this the oldest would give way.
@@ -132,8 +132,8 @@ class ZenohCall:
                 key, opening, timeout_s=_OPEN_TIMEOUT_S, attachment_id=self._attachment_id
             )
             if not answers:
-                refusal = ConnectionLost(f"server {self.server_id} did not answer")
-                continue
+                # It may still open the stream: another must not be asked to.
+                raise ConnectionLost(f"server {self.server_id} did not answer")
             error = answers[0].error
             if error is None:
                 self._max_frame_bytes = info.max_message_bytes
@@ -150,7 +150,7 @@ class ZenohCall:
             self.lose(f"server {self.server_id} is gone, or the way to it")
 
     async def _send_frame(self, frame: pb.Frame) -> None:
-        # Past its limit a server's Zenoh link breaks off without a word.
+        # Far past its limit a server's Zenoh link drops a message without a word.
         if (size := frame.ByteSize()) > self._max_frame_bytes:
             error = FrameTooLarge(
                 f"expected a frame of at most {self._max_frame_bytes} bytes, got {size}"

@@ -10,7 +10,7 @@ import zenoh
 from google.protobuf.message import DecodeError, Message
 
 from vergence_proto.errors import BadShape
-from vergence_proto.keys import ANY, OPEN, StreamKeys, ask_key, server_key
+from vergence_proto.keys import ANY, OPEN, UNARY_KEYS, StreamKeys, ask_key, server_key
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.zenoh_peer import ZenohPeer, make_config, reason_of
 from vergence_service.transports import ZenohUnreachable
@@ -64,10 +64,10 @@ class ZenohServer:
         self._namespace = namespace
         self._peer = ZenohPeer(config)
         self._methods: Mapping[str, tuple[type[Message], Callable[[Any], Awaitable[Message]]]] = {
-            "info": (pb.GetServerInfoRequest, unary.server_info),
-            "stream": (pb.GetStreamRequest, unary.stream),
-            "reset": (pb.ResetStreamRequest, unary.reset),
-            "close": (pb.CloseStreamRequest, unary.close),
+            UNARY_KEYS["GetServerInfo"]: (pb.GetServerInfoRequest, unary.server_info),
+            UNARY_KEYS["GetStream"]: (pb.GetStreamRequest, unary.stream),
+            UNARY_KEYS["ResetStream"]: (pb.ResetStreamRequest, unary.reset),
+            UNARY_KEYS["CloseStream"]: (pb.CloseStreamRequest, unary.close),
         }
         self._attached: dict[str, asyncio.Task[None]] = {}  # by attachment id
         self._tasks: set[asyncio.Task[None]] = set()
@@ -107,22 +107,29 @@ class ZenohServer:
         if what != OPEN:
             self._start(self._answer(query, what))
             return
-        attachment_id = query.attachment.to_string() if query.attachment else ""
+        attachment_id = (
+            query.attachment.to_bytes().decode(errors="replace") if query.attachment else ""
+        )
+        if not attachment_id or attachment_id in self._attached:
+            error = BadShape("expected an attachment id of its own with each opening")
+            self._start(self._peer.refuse(query, status_of(error)))
+            return
         task = self._start(self._open(query, attachment_id))
+        # At once, so that a death that comes next finds it.
         self._attached[attachment_id] = task
-        task.add_done_callback(lambda _: self._attached.pop(attachment_id, None))
+        task.add_done_callback(lambda _: self._attached.pop(attachment_id))
 
     def _client_died(self, key: str) -> None:
         if task := self._attached.get(key.rpartition("/")[2]):
             task.cancel()  # its stream is detached, and kept for the grace
 
     async def _open(self, query: zenoh.Query, attachment_id: str) -> None:
-        try:
-            opening = _read(query, pb.OpenStream)
-        except BadShape as error:
-            await self._peer.refuse(query, status_of(error))
-            return
         with query:  # dropped at the latest when the call has ended
+            try:
+                opening = _read(query, pb.OpenStream)
+            except BadShape as error:
+                await self._peer.refuse(query, status_of(error))
+                return
             call = ZenohCall(
                 self._peer,
                 query,
