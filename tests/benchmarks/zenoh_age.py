@@ -7,7 +7,7 @@ camera's period, as a headset does that cannot keep up. Ages are from capture to
 consumer has the map in its hands. All consumers of maps run side by side, each on a connection of
 its own to one publisher in another process.
 
-- ``fifo``: Zenoh's default handler, a FIFO of 256. Its age grows until that is full.
+- ``fifo``: Zenoh's default handler. Its age grows for as long as the consumer is slow.
 - ``ring``: Zenoh's ring channel of one.
 - ``inbox``: the receiver of this project with a room of one, with the event loop blocked by the
   consumer's work.
@@ -28,6 +28,7 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import zenoh
@@ -54,7 +55,11 @@ def free_endpoint() -> str:
 
 
 def config(mode: str, endpoint: str) -> zenoh.Config:
-    way = {"listen__endpoints" if mode == "router" else "connect__endpoints": [endpoint]}
+    way: dict[str, Any] = {
+        "listen__endpoints" if mode == "router" else "connect__endpoints": [endpoint]
+    }
+    # On one machine large messages go through shared memory, which a headset does not have.
+    way["transport__shared_memory__enabled"] = False
     return make_config(max_message_bytes=1 << 24, mode=mode, **way)
 
 
