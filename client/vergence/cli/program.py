@@ -101,7 +101,8 @@ def _run(
     server: Annotated[
         str | None,
         typer.Option(
-            help="HOST:PORT of a running server; else one is started.", callback=_checked_server
+            help="HOST:PORT or zenoh://HOST:PORT of a running server; else one is started.",
+            callback=_checked_server,
         ),
     ] = None,
     out: Annotated[
@@ -180,7 +181,8 @@ def _batch(
 @app.command("doctor")
 def _doctor(
     server: Annotated[
-        str, typer.Option(help="HOST:PORT to look for.", callback=_checked_server)
+        str,
+        typer.Option(help="HOST:PORT or zenoh://HOST:PORT to look for.", callback=_checked_server),
     ] = DEFAULT_SERVER,
 ) -> None:
     """Tell what is installed, what is missing, and whether a server answers."""
