@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Self
 
@@ -66,12 +66,13 @@ class JobStatus:
 @dataclass(slots=True, eq=False)
 class _Running:
     since_s: float
-    task: asyncio.Task[None]
     frames_done: int = 0
+    task: asyncio.Task[None] | None = None
+    stepped: asyncio.Event = field(default_factory=asyncio.Event)  # the model is free again
 
 
 class JobQueue:
-    """Runs one job at a time, so that a sequence is done as early as it can be.
+    """Steps one job at a time, so that a sequence is done as early as it can be.
 
     Use it inside ``async with``; jobs run from :meth:`start` on. All of its methods belong to the
     event loop; files and the database are touched in threads.
@@ -82,7 +83,8 @@ class JobQueue:
         self._store = store
         self._limits = limits
         self._jobs: dict[str, Job] = {}  # as the store has them, oldest first
-        self._running: tuple[str, _Running] | None = None
+        self._running: dict[str, _Running] = {}  # at most one is stepped, one is being put away
+        self._leaving = False  # the server is shutting down
         self._last_job_s = _USUAL_JOB_S
         self._uploads = 0
         self._readers: Counter[str] = Counter()  # of results, which stay until they are read
@@ -155,11 +157,11 @@ class JobQueue:
     def status(self, job_id: str) -> JobStatus:
         """Raises UnknownSequence."""
         job = self._get(job_id)
-        if job.ended or self._running is None or self._running[0] != job_id:
+        running = self._running.get(job_id)
+        if job.ended or running is None:
             done = job.frames if job.state is JobState.DONE else 0
             ahead = 0 if job.ended else self._ahead(job)
             return JobStatus(job, done, ahead, job.fps, None)
-        running = self._running[1]
         fps = running.frames_done / max(time.monotonic() - running.since_s, 1e-6)
         left = job.frames - running.frames_done
         return JobStatus(job, running.frames_done, 0, fps or None, left / fps if fps else None)
@@ -180,10 +182,10 @@ class JobQueue:
         """Stop the job if it has not ended, and remove all that it has. Raises UnknownSequence."""
         self._get(job_id)
         del self._jobs[job_id]
-        if self._running is not None and self._running[0] == job_id:
-            task = self._running[1].task
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
+        running = self._running.get(job_id)
+        if running is not None and running.task is not None:
+            running.task.cancel()
+            await asyncio.gather(running.task, return_exceptions=True)
         await asyncio.to_thread(self._store.delete, job_id)
         await self._tell()
 
@@ -211,52 +213,63 @@ class JobQueue:
             self._readers[job_id] -= 1
 
     async def _run_all(self) -> None:
-        while True:
-            job = next((job for job in self._jobs.values() if not job.ended), None)
-            if job is None:
-                await self.change(within_s=_EXPIRE_EVERY_S)
-                continue
-            task = asyncio.create_task(self._run(job), name=f"sequence {job.job_id}")
-            self._running = job.job_id, _Running(time.monotonic(), task)
-            try:
-                await asyncio.wait([task])
-            finally:
-                task.cancel()
-                await asyncio.gather(task, return_exceptions=True)
-                self._last_job_s = time.monotonic() - self._running[1].since_s
-                self._running = None
-            if not task.cancelled() and task.exception():
-                return  # the server is shutting down
+        async with asyncio.TaskGroup() as tasks:
+            before: asyncio.Task[None] | None = None
+            while not self._leaving:
+                waiting = (job for job in self._jobs.values() if not job.ended)
+                job = next((job for job in waiting if job.job_id not in self._running), None)
+                if job is None:
+                    await self.change(within_s=_EXPIRE_EVERY_S)
+                    continue
+                running = self._running[job.job_id] = _Running(time.monotonic())
+                name = f"sequence {job.job_id}"
+                running.task = tasks.create_task(self._run(job, running), name=name)
+                # While one is put away the next is stepped, and no more: disks can be slow.
+                await running.stepped.wait()
+                if before is not None:
+                    await asyncio.wait([before])
+                before = running.task
 
-    async def _run(self, job: Job) -> None:
+    async def _run(self, job: Job, running: _Running) -> None:
+        try:
+            try:
+                ended = await self._stepped(job, running)
+            finally:
+                self._last_job_s = time.monotonic() - running.since_s
+                running.stepped.set()
+            await self._end(ended)
+        except (Draining, NotReady):
+            self._leaving = True
+        finally:
+            del self._running[job.job_id]
+
+    async def _stepped(self, job: Job, running: _Running) -> Job:
+        """The job as it is after its frames were stepped, or one of them was not."""
         if job.attempts >= _MAX_ATTEMPTS:
-            died = ModelFailed(f"the server died {job.attempts} times while it ran this sequence")
-            await self._end(_failed(job, died))
-            return
+            return _failed(
+                job, ModelFailed(f"the server died {job.attempts} times while it ran this sequence")
+            )
         started = replace(job, state=JobState.RUNNING, attempts=job.attempts + 1)
         await self._publish(started)
-        folder = self._store.folder(job.job_id)
+
+        def count_frame() -> None:
+            running.frames_done += 1
+
         try:
-            found = await run_job(self._engine, folder, started, self._count_frame)
+            folder = self._store.folder(job.job_id)
+            found = await run_job(self._engine, folder, started, count_frame)
         except (Draining, NotReady, asyncio.CancelledError):
             # Not the sequence's doing: it keeps its place, for this server or the next one.
-            if job.job_id in self._jobs:
-                await self._publish(replace(job, state=JobState.QUEUED))
+            await self._publish(replace(job, state=JobState.QUEUED))
             raise
         except DepthError as error:
-            await self._end(_failed(started, error))
+            return _failed(started, error)
         except Exception:
             log.exception("sequence %s failed in a way that nobody foresaw", job.job_id)
-            await self._end(_failed(started, ModelFailed("the server failed; its log says why")))
-        else:
-            await self._end(
-                replace(
-                    started,
-                    state=JobState.DONE,
-                    fps=self.status(job.job_id).fps,
-                    accuracy=None if found is None else asdict(found),
-                )
-            )
+            return _failed(started, ModelFailed("the server failed; its log says why"))
+        fps = job.frames / (time.monotonic() - running.since_s)
+        accuracy = None if found is None else asdict(found)
+        return replace(started, state=JobState.DONE, fps=fps, accuracy=accuracy)
 
     async def _end(self, job: Job) -> None:
         result = self._store.folder(job.job_id) / "result"
@@ -276,10 +289,6 @@ class JobQueue:
     async def _tell(self) -> None:
         async with self._changed:
             self._changed.notify_all()
-
-    def _count_frame(self) -> None:
-        if self._running is not None:
-            self._running[1].frames_done += 1
 
     async def _expire_now_and_then(self) -> None:
         while True:
@@ -334,10 +343,10 @@ class JobQueue:
 
     def _usual_job_s(self) -> float:
         """How long until a place is free, as far as anybody can tell."""
-        if self._running is not None:
-            eta_s = self.status(self._running[0]).eta_s
-            if eta_s is not None:
-                return eta_s
+        etas_s = [self.status(job_id).eta_s for job_id in self._running]
+        known_s = [eta_s for eta_s in etas_s if eta_s is not None]
+        if known_s:
+            return max(known_s)
         return self._last_job_s
 
 

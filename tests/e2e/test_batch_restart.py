@@ -19,10 +19,12 @@ ARCHIVES = [zip_bytes(sequence_files(make_frames(5, brightness=10 * n))) for n i
 
 
 @asynccontextmanager
-async def killed_server(directory: Path) -> AsyncIterator[httpx.AsyncClient]:
+async def killed_server(
+    directory: Path, *, step_s: float = 0.0
+) -> AsyncIterator[httpx.AsyncClient]:
     """A server in a process of its own, which ends by SIGKILL."""
     process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "tests.e2e.batch_server", str(directory)),
+        *(sys.executable, "-m", "tests.e2e.batch_server", str(directory), str(step_s)),
         cwd=REPOSITORY,
         stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.PIPE,
@@ -39,7 +41,8 @@ async def killed_server(directory: Path) -> AsyncIterator[httpx.AsyncClient]:
 
 
 async def test_a_killed_server_finishes_all_that_it_accepted(tmp_path: Path) -> None:
-    async with killed_server(tmp_path) as client:
+    # Slow enough that the kill is in the middle of the batch, and of a sequence.
+    async with killed_server(tmp_path, step_s=0.04) as client:
         job_ids = [(await submit(client, archive))["id"] for archive in ARCHIVES]
         await ended(client, job_ids[2])
         before = {each["id"]: each["state"] for each in (await client.get("/v1/sequences")).json()}
