@@ -2,13 +2,14 @@
 
 import secrets
 from collections import deque
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Awaitable, Callable
 
 import zenoh
 from google.protobuf.message import Message
 from google.rpc import status_pb2
 
 from vergence.transports.base import ConnectionLost
+from vergence.transports.zenoh_losses import Unanswered
 from vergence_proto import codec
 from vergence_proto.errors import (
     DepthError,
@@ -39,10 +40,8 @@ _NO_ROOM = (StreamLimit, StateMemory, Draining, NotReady)
 class ZenohCall:
     """A :class:`~vergence.transports.base.Call`.
 
-    A live frame may be lost on the way, and so may its answer; both are found out and told as
-    ``FramesDropped``, so every frame is answered here as it is over gRPC. Maps come in order, so
-    the one that comes tells which were lost before it; and each pong says which frames are still
-    to be answered, so that the last ones are not waited for in vain.
+    What is lost on the way is found out and told as ``FramesDropped``, so that every frame is
+    answered here as it is over gRPC.
     """
 
     def __init__(
@@ -67,8 +66,7 @@ class ZenohCall:
         self._ready: deque[pb.StreamDepthResponse] = deque()
         self._live = True
         self._max_frame_bytes = 0
-        self._unanswered: dict[int, None] = {}  # frame ids, in order
-        self._sent_before: dict[int, int] = {}  # by ping: the last frame before it
+        self._unanswered = Unanswered()
 
     async def send(self, request: pb.StreamDepthRequest) -> None:
         try:
@@ -96,9 +94,9 @@ class ZenohCall:
                 raise ConnectionLost(f"the server sent more than was asked for: {error}") from None
             match message:
                 case pb.DisparityMap():
-                    self._take_map(message)
+                    self._take(pb.StreamDepthResponse(disparity=message))
                 case pb.StreamDepthResponse():
-                    self._take_status(message)
+                    self._take(message)
                 case pb.End():
                     self.over = True
                     return None
@@ -106,6 +104,12 @@ class ZenohCall:
                     self.over = True
                     raise codec.error_from_status(message) or ModelFailed(message.message)
         return self._ready.popleft()
+
+    def _take(self, response: pb.StreamDepthResponse) -> None:
+        if lost := self._unanswered.answered(response):
+            dropped = pb.FramesDropped(frame_ids=lost)
+            self._ready.append(pb.StreamDepthResponse(frames_dropped=dropped))
+        self._ready.append(response)
 
     async def close(self) -> None:
         self.lose("the call was closed")
@@ -158,49 +162,17 @@ class ZenohCall:
             refusal = codec.error_to_frame_error(frame.frame_id, error)
             self._inbox.put_own(pb.StreamDepthResponse(frame_error=refusal))
             return
-        self._unanswered[frame.frame_id] = None
+        self._unanswered.sent(frame.frame_id)
         await self._put(frame, may_drop=self._live)
 
     async def _send_ping(self, ping: pb.Ping) -> None:
-        waited_ns = ping.client_ns - min(self._sent_before, default=ping.client_ns)
-        if waited_ns > _PONG_PATIENCE_S * 1e9:
-            self.lose(f"server {self.server_id} has not answered for {waited_ns * 1e-9:.0f} s")
-        self._sent_before[ping.client_ns] = max(self._unanswered, default=0)
+        silent_s = self._unanswered.silent_s(ping.client_ns)
+        if silent_s > _PONG_PATIENCE_S:
+            self.lose(f"server {self.server_id} has not answered for {silent_s:.0f} s")
+        self._unanswered.pinged(ping.client_ns)
         await self._put(ping, may_drop=self._live)
 
     async def _put(self, message: Message, *, may_drop: bool = False) -> None:
         await self._peer.put(
             self._keys.frames, message, attachment_id=self._attachment_id, may_drop=may_drop
         )
-
-    def _take_map(self, message: pb.DisparityMap) -> None:
-        self._tell_lost(frame_id for frame_id in self._unanswered if frame_id < message.frame_id)
-        self._unanswered.pop(message.frame_id, None)
-        self._ready.append(pb.StreamDepthResponse(disparity=message))
-
-    def _take_status(self, message: pb.StreamDepthResponse) -> None:
-        match message.WhichOneof("message"):
-            case "frame_error":
-                self._unanswered.pop(message.frame_error.frame_id, None)
-            case "frames_dropped":
-                for frame_id in message.frames_dropped.frame_ids:
-                    self._unanswered.pop(frame_id, None)
-            case "pong":
-                last = self._sent_before.get(message.pong.client_ns, 0)
-                # Pings before this one were lost, or their pongs were.
-                for client_ns in [ns for ns in self._sent_before if ns <= message.pong.client_ns]:
-                    del self._sent_before[client_ns]
-                waiting = set(message.pong.unanswered_frame_ids)
-                self._tell_lost(
-                    frame_id
-                    for frame_id in self._unanswered
-                    if frame_id <= last and frame_id not in waiting
-                )
-        self._ready.append(message)
-
-    def _tell_lost(self, frame_ids: Iterable[int]) -> None:
-        if lost := list(frame_ids):
-            for frame_id in lost:
-                del self._unanswered[frame_id]
-            dropped = pb.FramesDropped(frame_ids=lost)
-            self._ready.append(pb.StreamDepthResponse(frames_dropped=dropped))

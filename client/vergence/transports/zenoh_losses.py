@@ -1,0 +1,57 @@
+"""Which frames of a call have no answer yet, and which of those will never have one."""
+
+from collections.abc import Iterable
+
+from vergence_proto.v1 import depth_pb2 as pb
+
+
+class Unanswered:
+    """What tells a lost frame from a late one.
+
+    A live frame may be lost on the way, and so may its answer. Maps come in order, so each tells
+    which frames before it were lost; and each pong says which of the frames before its ping are
+    still to be answered, so that the last ones are not waited for in vain.
+    """
+
+    def __init__(self) -> None:
+        self._frames: dict[int, None] = {}  # ids, in order
+        self._last_before: dict[int, int] = {}  # by ping: the last frame id sent before it
+
+    def sent(self, frame_id: int) -> None:
+        self._frames[frame_id] = None
+
+    def pinged(self, client_ns: int) -> None:
+        self._last_before[client_ns] = max(self._frames, default=0)
+
+    def silent_s(self, now_ns: int) -> float:
+        """How long the oldest ping without a pong has been waiting."""
+        return (now_ns - min(self._last_before, default=now_ns)) * 1e-9
+
+    def answered(self, response: pb.StreamDepthResponse) -> list[int]:
+        """Take in what came: the ids of the frames that it proves to be lost, in order."""
+        lost: list[int] = []
+        match response.WhichOneof("message"):
+            case "disparity":
+                map_id = response.disparity.frame_id
+                self._frames.pop(map_id, None)
+                lost = [frame_id for frame_id in self._frames if frame_id < map_id]
+            case "frame_error":
+                self._frames.pop(response.frame_error.frame_id, None)
+            case "frames_dropped":
+                self._forget(response.frames_dropped.frame_ids)
+            case "pong":
+                lost = self._lost_before(response.pong)
+        self._forget(lost)
+        return lost
+
+    def _lost_before(self, pong: pb.Pong) -> list[int]:
+        last = self._last_before.get(pong.client_ns, 0)
+        # Pings before this one were lost, or their pongs were.
+        for client_ns in [each for each in self._last_before if each <= pong.client_ns]:
+            del self._last_before[client_ns]
+        waiting = set(pong.unanswered_frame_ids)
+        return [each for each in self._frames if each <= last and each not in waiting]
+
+    def _forget(self, frame_ids: Iterable[int]) -> None:
+        for frame_id in frame_ids:
+            self._frames.pop(frame_id, None)
