@@ -39,6 +39,7 @@ class TrainingConfig:
     weight_decay: float = 1e-5
     gradient_norm: float = 1.0
     ema_decay: float = 0.997
+    stretch_share: float = 0.5  # clips blown up to larger disparities
     identity_share: float = 0.05  # clips that hide the motion: the network must cope without poses
     noise_share: float = 0.3  # clips whose poses are off by up to the two limits below
     noise_deg: float = 0.3

@@ -269,7 +269,7 @@ class Refinement(nn.Module):
         width = config.fine_channels
         self.hidden = conv(config.hidden, 16, kernel=1)
         self.first = conv(config.context_quarter + 16 + 12, width, kernel=1)
-        self.choose = silent(conv(width, 4, kernel=1))
+        self.choose = silent(conv(width, 4))
         self.second = conv(width + 2 * TAPS + 6, width)
         self.out = silent(conv(width, 3, kernel=1))
         self.upsample = ConvexUpsampler(width)
@@ -302,20 +302,23 @@ class Refinement(nn.Module):
 
         # Sub-pixel: the centre of the peak that the window's mean makes along the surface. A
         # larger position is a smaller disparity.
-        taps = lookup_row(pairs, position(d), REACH).permute(0, 3, 1, 2)
+        looked_at = position(d)
+        taps = lookup_row(pairs, looked_at, REACH).permute(0, 3, 1, 2)
         smooth = box3(taps)
         fit = shares(self.subpixel * smooth, dim=1)
         offset = added([fit[:, k : k + 1] * (FINE_PX * (REACH - k)) for k in range(TAPS)])
         d = d + offset
         step = carried - d
-        small = (squash(step, 0.5), squash(offset, 0.5), apart, hole)
+        # Interpolated entries flatten a peak between two of them: tell where between them it lies.
+        phase = (looked_at - torch.floor(looked_at)).permute(0, 3, 1, 2).detach()
+        small = (squash(step, 0.5), squash(offset, 0.5), apart[:, :2], phase, hole)
         x = F.relu(self.second(torch.cat((x, taps, smooth, *small), dim=1)))
         out = self.out(x)
         # The previous frame's surface is evidence too, while it agrees: half of a small step.
         keep = torch.sigmoid(4 * out[:, 1:2]) * torch.exp(-step.abs()) * (1 - hole)
         d = (d + keep * step + 2 * out[:, :1]).clamp(min=MIN_PX)
         # Half a pixel at first; within e^-3.5 and e^4 times that.
-        sigma = 0.5 * torch.exp((4 * out[:, 2:]).clamp(-3.5, 4))
+        sigma = 0.5 * torch.exp((4 * out[:, 2:]).clamp(-3.5, 4.0))
         full = self.upsample(x, d).clamp(min=MIN_PX)
         return full, F.interpolate(sigma, scale_factor=4.0, mode="bilinear")[:, 0], d
 

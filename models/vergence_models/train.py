@@ -26,6 +26,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vergence_models.augment import stretched
 from vergence_models.config import CONFIGS, Config, load_config
 from vergence_models.data.clips import StereoClips
 from vergence_models.data.pool import ClipPool
@@ -195,6 +196,7 @@ def train(trainer: Trainer, arguments: argparse.Namespace) -> None:
         clips = pool.sample(
             trainer.random, training.batch, frames=training.frames, reverse=0.5, skip=0.3, flip=0.3
         )
+        clips = stretched(clips, trainer.random, share=training.stretch_share)
         recent.append(trainer.step(film_as_sensor(clips, trainer.random)))
         now = time.monotonic()
         trainer.progress.minutes += (now - last) / 60

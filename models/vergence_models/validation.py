@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -95,5 +96,5 @@ def save_picture(
     cv2.imwrite(str(path), np.concatenate(rows, axis=0))
 
 
-def to_bytes(share: NDArray[np.float32]) -> NDArray[np.uint8]:
+def to_bytes(share: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
     return np.asarray(np.clip(share, 0, 1) * 255, np.uint8)

@@ -1,0 +1,58 @@
+"""Stretched windows of clips: larger disparities, wider occlusions, other cameras, for nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from vergence_models.data.clips import StereoClips
+
+MAX_STRETCH = 4.0
+
+
+def stretched(clips: StereoClips, random: np.random.Generator, *, share: float) -> StereoClips:
+    """Each clip, with chance ``share``, as a window of it blown up to the whole size.
+
+    Rows grow by up to :data:`MAX_STRETCH` and columns by less, so disparity grows with the rows;
+    poses stay true because the camera matrix follows.
+    """
+    singles = [clips[index : index + 1] for index in range(len(clips))]
+    return StereoClips.concatenate(
+        [_stretched(one, random) if random.random() < share else one for one in singles]
+    )
+
+
+def _stretched(clip: StereoClips, random: np.random.Generator) -> StereoClips:
+    height, width = clip.disparity_px.shape[-2:]
+    window_width = int(width / random.uniform(1, MAX_STRETCH))
+    window_height = int(height / random.uniform(1, max(1.0, width / window_width / 1.5)))
+    x = int(random.integers(width - window_width + 1))
+    y = int(random.integers(height - window_height + 1))
+    across, down = width / window_width, height / window_height
+
+    def window(images: Tensor) -> Tensor:
+        return images[..., y : y + window_height, x : x + window_width]
+
+    def grown(planes: Tensor) -> Tensor:
+        return F.interpolate(window(planes)[0, :, None].float(), (height, width))[None, :, 0]
+
+    def seen(images: Tensor) -> Tensor:
+        cut = window(images)[0].float()
+        large = F.interpolate(cut, (height, width), mode="bilinear", align_corners=False)
+        return large.round().clamp(0, 255).to(torch.uint8)[None]
+
+    return replace(
+        clip,
+        left=seen(clip.left),
+        right=seen(clip.right),
+        disparity_px=grown(clip.disparity_px) * across,
+        visible=grown(clip.visible) > 0.5,
+        fx=clip.fx * across,
+        fy=clip.fy * down,
+        cx=(clip.cx - x + 0.5) * across - 0.5,
+        cy=(clip.cy - y + 0.5) * down - 0.5,
+    )

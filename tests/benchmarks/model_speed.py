@@ -1,0 +1,99 @@
+"""What a step of lite costs beside StereoSGBM: one run, one image pair, side by side.
+
+    python tests/benchmarks/model_speed.py --json FILE
+
+The whole warm graph, 640x480, batch 1, one iteration, two onnxruntime threads; SGBM 3-way with its
+holes filled, at full and at half size. The methods take turns, so that a busy moment of the machine
+hits all of them. Times are medians in milliseconds; CPU time counts every thread of the process.
+"""
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vergence_models.sgbm import sgbm_disparity
+from vergence_models.stepping import OnnxNetwork
+
+HEIGHT, WIDTH = 480, 640
+WEIGHTS = Path(__file__).parents[2] / "models" / "vergence_models" / "weights"
+
+
+def textured_pair() -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """A scene of slanted strips with texture at every scale: uint8 [H, W, 3] twice."""
+    random = np.random.default_rng(0)
+    texture = np.zeros((HEIGHT, WIDTH + 128, 3), np.float32)
+    for scale in (2, 8, 32, 128):
+        small = random.uniform(-1, 1, (HEIGHT // scale + 1, (WIDTH + 128) // scale + 1, 3))
+        texture += cv2.resize(small.astype(np.float32), texture.shape[1::-1]) * 32
+    texture = (texture + 128).clip(0, 255)
+    column, row = np.meshgrid(
+        np.arange(WIDTH, dtype=np.float32), np.arange(HEIGHT, dtype=np.float32)
+    )
+    disparity = 10 + row / 12 + 8 * np.floor(column / 160)
+    left = cv2.remap(texture, column, row, cv2.INTER_LINEAR)
+    right = cv2.remap(texture, column + disparity, row, cv2.INTER_LINEAR)
+    return left.astype(np.uint8), right.astype(np.uint8)
+
+
+def measure(
+    methods: dict[str, Callable[[], object]], rounds: int
+) -> dict[str, tuple[float, float]]:
+    """Name -> median wall and CPU milliseconds; the methods take turns."""
+    times: dict[str, list[tuple[float, float]]] = {name: [] for name in methods}
+    for turn in range(rounds + 3):
+        for name, run in methods.items():
+            cpu, wall = time.process_time(), time.perf_counter()
+            run()
+            spent = 1e3 * (time.perf_counter() - wall), 1e3 * (time.process_time() - cpu)
+            if turn >= 3:  # the first turns warm caches and thread pools up
+                times[name].append(spent)
+    return {
+        name: (float(np.median([w for w, _ in rows])), float(np.median([c for _, c in rows])))
+        for name, rows in times.items()
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--weights", type=Path, default=WEIGHTS)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--rounds", type=int, default=40)
+    given = parser.parse_args()
+    left, right = textured_pair()
+    network = OnnxNetwork(given.weights, "lite", threads=given.threads)
+    still = np.eye(4, dtype=np.float32)[None]
+    _, _, state = network.run(
+        left[None], right[None], still, network.cold_state(HEIGHT, WIDTH), max(network.card.graphs)
+    )
+    found = measure(
+        {
+            "lite": lambda: network.run(left[None], right[None], still, state, 1),
+            "sgbm_full": lambda: sgbm_disparity(left, right),
+            "sgbm_half": lambda: sgbm_disparity(left, right, scale=0.5),
+        },
+        given.rounds,
+    )
+    wall_ms, cpu_ms = found["lite"]
+    results = {
+        "lite_ms": wall_ms,
+        "lite_cpu_ms": cpu_ms,
+        "sgbm_full_cpu_ms": found["sgbm_full"][1],
+        "sgbm_half_cpu_ms": found["sgbm_half"][1],
+        "fps": 1e3 / wall_ms,
+    }
+    results = {name: round(value, 2) for name, value in results.items()}
+    sys.stdout.write(" ".join(f"{name} {value}" for name, value in results.items()) + "\n")
+    if given.json:
+        given.json.write_text(json.dumps(results) + "\n", "utf-8")
+
+
+if __name__ == "__main__":
+    main()

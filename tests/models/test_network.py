@@ -1,0 +1,153 @@
+"""Laws of the network and its exported graphs."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from vergence_models.config import NetworkConfig
+from vergence_models.evaluate import WEIGHTS
+from vergence_models.export import check_parity, export_graph, shifted_pair
+from vergence_models.layers import all_pairs, banded, best_rival, lookup, lookup_row
+from vergence_models.network import State, StereoNetwork
+from vergence_models.stepping import OnnxNetwork
+
+HEIGHT, WIDTH = 192, 256
+
+
+@pytest.fixture(scope="module")
+def network() -> StereoNetwork:
+    torch.manual_seed(3)
+    return StereoNetwork(NetworkConfig()).eval()
+
+
+@pytest.fixture(scope="module")
+def shipped() -> OnnxNetwork:
+    return OnnxNetwork(WEIGHTS, "lite", threads=2)
+
+
+def views(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
+    left, right = shifted_pair(HEIGHT, WIDTH, seed)
+    return torch.from_numpy(left), torch.from_numpy(right)
+
+
+def test_an_untrained_network_already_matches(network: StereoNetwork) -> None:
+    left, right = views(0)
+    with torch.inference_mode():
+        estimate, _ = network(
+            left, right, torch.eye(4)[None], network.cold_state(1, *(left.shape[1:3])), 1
+        )
+    truth = torch.linspace(4, 40, HEIGHT).floor()[:, None].expand(HEIGHT, WIDTH)
+    seen = torch.arange(WIDTH) >= 48  # the rest has no match in the right image
+    error = (estimate.disparity[0] - truth).abs()[:, seen]
+    assert error.median() < 0.5
+    assert (error > 3).float().mean() < 0.1
+
+
+def test_the_graph_equals_pytorch_frame_by_frame(
+    network: StereoNetwork, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Under pytest's capture the tracer would format every symbolic shape it meets: minutes of it.
+    monkeypatch.setattr(logging.getLogger("torch.__trace"), "propagate", False)
+    path = tmp_path / "lite_2.onnx"
+    export_graph(network, 2, path)
+    assert check_parity(network, 2, path, frames=4) < 2e-3
+
+
+def test_rows_of_a_pytorch_batch_are_independent(network: StereoNetwork) -> None:
+    a, b = views(1), views(2)
+    state = State(
+        torch.rand(2, 1, HEIGHT // 4, WIDTH // 4) * 30,
+        torch.randn(2, network.config.hidden, HEIGHT // 8, WIDTH // 8),
+    )
+    matrix = torch.eye(4).repeat(2, 1, 1)
+    matrix[1, 0, 3] = 3.0
+    with torch.inference_mode():
+        both, _ = network(torch.cat((a[0], b[0])), torch.cat((a[1], b[1])), matrix, state, 1)
+        alone, _ = network(*b, matrix[1:], State(state.disparity[1:], state.hidden[1:]), 1)
+    # PyTorch picks its convolution by batch size, so not to the bit.
+    assert (both.disparity[1] - alone.disparity[0]).abs().mean() < 1e-3
+
+
+def test_rows_of_a_served_batch_are_identical_to_the_bit(shipped: OnnxNetwork) -> None:
+    pairs = [shifted_pair(HEIGHT, WIDTH, seed) for seed in range(3)]
+    random = np.random.default_rng(0)
+    state = tuple(
+        random.uniform(0, 9, (3, *tensor.shape(HEIGHT, WIDTH))).astype(np.float32)
+        for tensor in shipped.card.state
+    )
+    matrix = np.eye(4, dtype=np.float32)[None].repeat(3, axis=0)
+    matrix[:, 0, 3] = (0.0, 2.5, -4.0)
+
+    def step(rows: slice) -> list[NDArray[np.float32]]:
+        left, right = (np.concatenate([pair[eye] for pair in pairs])[rows] for eye in (0, 1))
+        disparity, sigma, following = shipped.run(
+            left, right, matrix[rows], tuple(t[rows] for t in state), 1
+        )
+        return [disparity, sigma, *following]
+
+    together = step(slice(0, 3))
+    for row in range(3):
+        for one, all_of in zip(step(slice(row, row + 1)), together, strict=True):
+            np.testing.assert_array_equal(one[0], all_of[row])
+
+
+def test_shipped_graphs_agree_whatever_the_size(shipped: OnnxNetwork) -> None:
+    for height, width in ((192, 224), (224, 256), (480, 640)):
+        left, right = shifted_pair(height, width, 4)
+        disparity, sigma, following = shipped.run(
+            left, right, np.eye(4, dtype=np.float32)[None], shipped.cold_state(height, width), 4
+        )
+        assert disparity.shape == sigma.shape == (1, height, width)
+        assert disparity.min() > 0
+        assert sigma.min() > 0
+        for tensor, value in zip(shipped.card.state, following, strict=True):
+            assert value.shape == (1, *tensor.shape(height, width))
+        truth = np.linspace(4, 40, height).astype(int)[:, None]
+        assert np.median(np.abs(disparity[0, :, 48:] - truth)) < 0.5
+
+
+@pytest.mark.parametrize("ratio", [1, 2])
+def test_banded_reindexes_pairs_by_disparity(ratio: int) -> None:
+    pairs = torch.randn(2, 3, 10, 10 * ratio)
+    volume = banded(pairs, 6)
+    for x in range(10):
+        for d in range(6):
+            right = ratio * x - d
+            expected = pairs[:, :, x, right] if right >= 0 else torch.zeros(2, 3)
+            assert torch.equal(volume[:, :, x, 5 - d], expected)
+
+
+def test_best_rival_is_the_best_score_of_the_right_pixel() -> None:
+    scores = torch.randn(1, 2, 8, 5)
+    rival = best_rival(scores, 16)
+    for x in range(8):
+        for d in range(5):
+            right = 2 * x - d
+            if right < 0:
+                continue
+            claims = [
+                scores[0, 1, other, 4 - (2 * other - right)]
+                for other in range(8)
+                if 0 <= 2 * other - right < 5
+            ]
+            assert rival[0, 1, x, 4 - d] == max(claims)
+
+
+def test_all_pairs_is_the_mean_product_of_descriptors() -> None:
+    left, right = torch.randn(1, 6, 2, 4), torch.randn(1, 6, 2, 8)
+    expected = torch.einsum("bchx,bchy->bhxy", left, right) / 6
+    assert torch.allclose(all_pairs(left, right), expected, atol=1e-6)
+
+
+def test_lookups_interpolate_and_are_zero_outside() -> None:
+    volume = torch.arange(8.0).view(1, 1, 1, 8) ** 2
+    at = torch.tensor([2.5, 6.25, -0.5, 7.5]).view(1, 1, 1, 4)
+    assert lookup(volume, at).flatten().tolist() == pytest.approx([6.5, 39.25, 0.0, 0.0])
+    row = lookup_row(volume, torch.full((1, 1, 1, 1), 3.5), 1)
+    assert row.flatten().tolist() == pytest.approx([6.5, 12.5, 20.5])

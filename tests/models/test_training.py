@@ -1,0 +1,155 @@
+"""Laws of training: a stopped run goes on as if it had never stopped, and no other run's does."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.models.clips import wall_clips
+from vergence_models import config as configs
+from vergence_models.config import Config, NetworkConfig, TrainingConfig, load_config
+from vergence_models.data.pool import ClipPool, write_shard
+from vergence_models.losses import laplace_nll, step_loss
+from vergence_models.motion import perturbed, uvd_transforms
+from vergence_models.runs import CHECKPOINT_NAME, RunError, load_checkpoint, read_run
+from vergence_models.train import Trainer, main
+from vergence_models.validation import predict, validate
+
+SMALL = Config(
+    "lite",
+    network=NetworkConfig(context_eighth=16, context_low=16),
+    training=TrainingConfig(frames=2, warmup_steps=1),
+)
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> None:
+    torch.set_num_threads(1)
+
+
+@pytest.fixture
+def pool(tmp_path: Path) -> Path:
+    write_shard(tmp_path / "pool" / "shard_1_000000", wall_clips(3))
+    return tmp_path / "pool"
+
+
+def steps(trainer: Trainer, pool: Path, count: int) -> None:
+    clips = ClipPool(pool)
+    for _ in range(count):
+        trainer.step(clips.sample(trainer.random, 1, frames=2))
+
+
+def test_a_resumed_run_equals_one_that_was_never_stopped(pool: Path, tmp_path: Path) -> None:
+    straight = Trainer(SMALL, torch.device("cpu"))
+    steps(straight, pool, 3)
+
+    stopped = Trainer(SMALL, torch.device("cpu"))
+    steps(stopped, pool, 2)
+    stopped.save(tmp_path)
+    resumed = Trainer(SMALL, torch.device("cpu"))
+    resumed.resume(tmp_path)
+    steps(resumed, pool, 1)
+
+    assert resumed.progress.steps == straight.progress.steps == 3
+    assert resumed.progress.frames == straight.progress.frames
+    for name, value in straight.network.state_dict().items():
+        assert torch.equal(resumed.network.state_dict()[name], value), name
+        assert torch.equal(resumed.average[name], straight.average[name]), name
+
+
+def test_the_command_trains_saves_and_goes_on(
+    pool: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(configs.CONFIGS, "lite", SMALL)
+    out = tmp_path / "run"
+    command = ["--pool", str(pool), "--out", str(out), "--batch", "1", "--frames", "2"]
+    main([*command, "--val", str(pool), "--minutes", "0.01", "--log-every", "1"])
+    first = read_run(out)
+    assert first.story["steps"] >= 1
+    assert first.measured["warm_epe"] > 0
+    main([*command, "--resume", "--minutes", "0.01", "--log-every", "1"])
+    second = read_run(out)
+    assert second.story["steps"] > first.story["steps"]
+    assert len(second.story["commands"]) == 2
+    with pytest.raises(SystemExit, match="add --resume"):
+        main([*command, "--minutes", "0.01"])
+
+
+def test_another_configuration_is_refused_by_file_and_expectation(tmp_path: Path) -> None:
+    Trainer(SMALL, torch.device("cpu")).save(tmp_path)
+    other = dataclasses.replace(SMALL, network=dataclasses.replace(SMALL.network, hidden=16))
+    with pytest.raises(RunError, match=rf"{CHECKPOINT_NAME}: expected hidden = 16, the run has 32"):
+        Trainer(other, torch.device("cpu")).resume(tmp_path)
+    renamed = dataclasses.replace(SMALL, name="full")
+    with pytest.raises(RunError, match="expected a run of configuration 'full', got 'lite'"):
+        Trainer(renamed, torch.device("cpu")).resume(tmp_path)
+
+
+def test_a_missing_or_damaged_checkpoint_is_named(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=f"no checkpoint at {tmp_path}"):
+        load_checkpoint(tmp_path)
+    (tmp_path / CHECKPOINT_NAME).write_bytes(b"not a checkpoint")
+    with pytest.raises(RunError, match=f"{CHECKPOINT_NAME}: expected a checkpoint"):
+        load_checkpoint(tmp_path)
+
+
+def test_an_unknown_configuration_names_those_there_are() -> None:
+    with pytest.raises(configs.ConfigError, match="'huge'; there are: lite"):
+        load_config("huge")
+
+
+def test_training_lowers_the_loss(pool: Path) -> None:
+    trainer = Trainer(SMALL, torch.device("cpu"))
+    clips = ClipPool(pool).clips([0])
+    losses = [trainer.step(clips)["loss"] for _ in range(12)]
+    assert sum(losses[-3:]) < sum(losses[:3])
+
+
+def test_unknown_truth_costs_nothing() -> None:
+    trainer = Trainer(SMALL, torch.device("cpu"))
+    clips = wall_clips(1)
+    [estimate, *_] = predict(trainer.network.eval(), clips, torch.device("cpu"))
+    truth = clips.disparity_px[:, 0]
+    half = truth.clone()
+    half[:, :, 112:] = 0
+    wrong = half.clone()
+    wrong[:, :, 112:] = 500  # beyond the range: as good as unknown
+    assert step_loss(estimate, half, 192) == step_loss(estimate, wrong, 192)
+    assert step_loss(estimate, truth, 192) != step_loss(estimate, half, 192)
+
+
+def test_the_best_sigma_is_the_mean_error() -> None:
+    errors = torch.tensor([0.2, 0.4, 1.2, 2.2])
+    candidates = torch.linspace(0.3, 3, 271)
+    costs = torch.stack([laplace_nll(errors, sigma).mean() for sigma in candidates])
+    assert candidates[costs.argmin()].item() == pytest.approx(errors.mean().item(), abs=0.011)
+
+
+def test_transforms_carry_the_wall_along() -> None:
+    clips = wall_clips(2)
+    matrix = uvd_transforms(clips, clips.world_from_left)
+    assert torch.equal(matrix[:, 0], torch.eye(4).expand(2, 4, 4))
+    moved = matrix[:, 1] @ torch.tensor([100.0, 20.0, 12.0, 1.0])
+    # A step aside of half a baseline moves what is at 12 px by 6 px, and leaves its disparity.
+    expected = torch.tensor([94.0, 20.0, 12.0]).expand(2, 3)
+    assert torch.allclose(moved[:, :3] / moved[:, 3:], expected, atol=1e-3)
+
+
+def test_noise_of_poses_stays_small_and_rigid() -> None:
+    import numpy as np
+
+    poses = wall_clips(2).world_from_left
+    noisy = perturbed(poses, max_deg=0.3, max_m=0.002, random=np.random.default_rng(0))
+    rotation = noisy[..., :3, :3]
+    assert torch.allclose(rotation @ rotation.mT, torch.eye(3, dtype=torch.float64), atol=1e-9)
+    assert 0 < (noisy - poses).abs().max() < 0.02
+
+
+def test_validation_measures_cold_and_warm(pool: Path) -> None:
+    found = validate(
+        Trainer(SMALL, torch.device("cpu")).network.eval(), ClipPool(pool), torch.device("cpu")
+    )
+    assert {"cold_epe", "warm_epe", "cold_d1", "warm_d3", "warm_cover"} <= set(found)
