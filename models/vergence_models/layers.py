@@ -109,9 +109,9 @@ def lookup(volume: Tensor, position: Tensor) -> Tensor:
 
 
 def lookup_row(volume: Tensor, position: Tensor, reach: int) -> Tensor:
-    """:func:`lookup` at each ``position`` [B, H, W, 1] and at ``reach`` steps to either side of it.
+    """Interpolate at each ``position`` [B, H, W, 1] and ``reach`` steps to either side of it.
 
-    """Interpolate at each ``position`` [B, H, W, 1] and up to ``reach`` steps to either side of it."""
+    Returns [B, H, W, 2 reach + 1]. Neighbours share their entries, which halves the gathers.
     """
     position = position.detach()
     last = volume.shape[-1] - 1
