@@ -34,7 +34,7 @@ def serve(
     ] = False,
     grpc_port: Annotated[int | None, typer.Option(help="0: a free one.")] = None,
     http_port: Annotated[int | None, typer.Option(help="0: a free one.")] = None,
-    host: Annotated[str | None, typer.Option(help="To listen on, for both.")] = None,
+    host: Annotated[str | None, typer.Option(help="To listen on, for all.")] = None,
     zenoh: Annotated[
         bool | None, typer.Option("--zenoh/--no-zenoh", help="Serve over Zenoh too.")
     ] = None,
@@ -77,7 +77,7 @@ def serve(
 
 
 def _announce(server: Running) -> None:
-    zenoh = f" zenoh={server.zenoh_endpoint}" if server.zenoh_endpoint else ""
+    zenoh = f" zenoh={server.zenoh.endpoint}" if server.zenoh else ""
     typer.echo(f"listening grpc={server.grpc_address} http={server.http_address}{zenoh}")
     sys.stdout.flush()
 

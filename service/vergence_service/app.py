@@ -10,7 +10,6 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from prometheus_client import CollectorRegistry
 
@@ -22,9 +21,9 @@ from vergence_service.job_queue import JobQueue, QueueLimits
 from vergence_service.jobs import JobStore, StoreUnavailable
 from vergence_service.metrics import Metrics
 from vergence_service.model import OnnxStereoModel, StereoModel, packaged_weights_dir
-from vergence_service.settings import Settings, ZenohSettings
+from vergence_service.settings import Settings
 from vergence_service.streams import StreamTable
-from vergence_service.transports import ExtraMissing
+from vergence_service.transports import place
 from vergence_service.transports.calls import OpenCalls
 from vergence_service.transports.depth_call import StreamLimits
 from vergence_service.transports.grpc_server import DepthServicer, GrpcServer
@@ -33,11 +32,9 @@ from vergence_service.transports.http_pairs import pair_routes
 from vergence_service.transports.http_sequences import no_sequence_routes, sequence_routes
 from vergence_service.transports.http_uploads import UploadLimits
 from vergence_service.transports.unary import UnaryMethods
+from vergence_service.zenoh_face import ZenohFace, on_zenoh
 
 log = logging.getLogger(__name__)
-
-if TYPE_CHECKING:  # Zenoh is an extra
-    from vergence_service.transports.zenoh_server import ZenohServer
 
 _MIB = 1 << 20
 _SWEEP_EVERY_S = 1.0
@@ -51,8 +48,7 @@ class Running:
     http_address: str
     engine: DepthEngine
     grpc: GrpcServer
-    zenoh: "ZenohServer | None"
-    zenoh_endpoint: str | None
+    zenoh: ZenohFace | None
 
 
 def make_model(settings: Settings) -> OnnxStereoModel:
@@ -118,21 +114,20 @@ async def running(
             max_frame_bytes=max_frame_bytes,
         ) as grpc_server,
         _serving_http(settings, engine, registry) as (http_server, start_jobs),
-        _on_zenoh(settings, unary, open_calls(), max_frame_bytes) as zenoh_server,
+        on_zenoh(settings, unary, open_calls()) as zenoh,
         _sweeping(streams),
     ):
         await engine.start()
         start_jobs()
         await grpc_server.serving()
-        if zenoh_server is not None:
-            await zenoh_server.serving()
+        if zenoh is not None:
+            await zenoh.server.serving()
         yield Running(
-            f"{settings.grpc.host}:{grpc_server.port}",
-            f"{settings.http.host}:{http_server.port}",
+            place(settings.grpc.host, grpc_server.port),
+            place(settings.http.host, http_server.port),
             engine,
             grpc_server,
-            zenoh_server,
-            _endpoint(settings.zenoh) if zenoh_server is not None else None,
+            zenoh,
         )
 
 
@@ -154,38 +149,7 @@ async def drain(server: Running, *, within_s: float) -> None:
     async with asyncio.TaskGroup() as tasks:
         tasks.create_task(server.grpc.drain(within_s=within_s))
         if server.zenoh is not None:
-            tasks.create_task(server.zenoh.drain(within_s=within_s))
-
-
-def _endpoint(chosen: ZenohSettings) -> str:
-    """Where the server is to be found, in as few words as there are."""
-    if chosen.config is not None:
-        return str(chosen.config)
-    return ",".join(chosen.connect if chosen.mode == "client" else chosen.listen)
-
-
-@asynccontextmanager
-async def _on_zenoh(
-    settings: Settings, unary: UnaryMethods, calls: OpenCalls, max_frame_bytes: int
-) -> AsyncIterator["ZenohServer | None"]:
-    """Raises ExtraMissing, ZenohUnreachable."""
-    if not settings.zenoh.enabled:
-        yield None
-        return
-    try:
-        from vergence_service.transports.zenoh_server import ZenohServer, zenoh_config
-    except ImportError:
-        raise ExtraMissing("Zenoh", "zenoh") from None
-    chosen = settings.zenoh
-    config = zenoh_config(
-        chosen.config,
-        mode=chosen.mode,
-        listen=chosen.listen,
-        connect=chosen.connect,
-        max_frame_bytes=max_frame_bytes,
-    )
-    async with ZenohServer(unary, calls, config=config, namespace=chosen.namespace) as server:
-        yield server
+            tasks.create_task(server.zenoh.server.drain(within_s=within_s))
 
 
 @asynccontextmanager

@@ -67,7 +67,7 @@ class ZenohSettings(_Section):
         default="router", description="client or peer: joins the routers of connect"
     )
     listen: tuple[str, ...] = Field(
-        default=("tcp/127.0.0.1:7447",), description="endpoints; not for a client"
+        default=(), description="endpoints; a router without one: port 7447 on the host of gRPC"
     )
     connect: tuple[str, ...] = Field(default=(), description="endpoints of routers and peers")
     config: Path | None = Field(

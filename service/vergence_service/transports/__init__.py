@@ -1,6 +1,11 @@
 """Transports translate, and nothing else: bytes to values, errors to statuses, calls to calls."""
 
 
+def place(host: str, port: int) -> str:
+    """HOST:PORT, with an IPv6 address in brackets."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
 class PortTaken(OSError):
     """An address cannot be listened on."""
 

@@ -11,7 +11,7 @@ from grpc_reflection.v1alpha import reflection
 from vergence_proto.errors import BadShape
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.v1 import depth_pb2_grpc
-from vergence_service.transports import PortTaken
+from vergence_service.transports import PortTaken, place
 from vergence_service.transports.calls import OpenCalls
 from vergence_service.transports.grpc_errors import Context, errors_as_status
 from vergence_service.transports.unary import UnaryMethods
@@ -90,7 +90,7 @@ class GrpcServer:
         self, servicer: DepthServicer, *, host: str, port: int, max_frame_bytes: int
     ) -> None:
         self._servicer = servicer
-        self._address = f"{host}:{port}"
+        self._address = place(host, port)
         self._max_message_bytes = int(max_frame_bytes * _ROOM_OVER_THE_LIMIT)
         self._health = health.aio.HealthServicer()  # type: ignore[attr-defined] # bound at import
         self.port = port

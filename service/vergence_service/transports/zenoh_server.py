@@ -40,11 +40,10 @@ def zenoh_config(
     try:
         if file is not None:
             return make_config(file, max_message_bytes=bound)
-        # A client listens nowhere; a router that is not there yet is waited for.
         return make_config(
             max_message_bytes=bound,
             mode=mode,
-            listen__endpoints=[] if mode == "client" else list(listen),
+            listen__endpoints=list(listen),
             connect__endpoints=list(connect),
         )
     except zenoh.ZError as error:
