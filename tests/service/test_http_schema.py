@@ -18,6 +18,12 @@ from schemathesis.specs.openapi.checks import positive_data_acceptance
 from tests.support.models import RecallModel
 from tests.support.server import running_server
 
+
+@schemathesis.serializer("application/x-protobuf")
+def as_it_is(context: schemathesis.SerializationContext, content: bytes) -> bytes:
+    return content
+
+
 EXAMPLES = 20  # of every operation
 
 Case = schemathesis.Case[Any]

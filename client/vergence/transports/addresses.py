@@ -10,7 +10,8 @@ from vergence.transports.grpc import GrpcTransport
 from vergence_proto.keys import DEFAULT_NAMESPACE
 
 _EXPECTED = (
-    "expected a server as grpc://HOST:PORT or zenoh://HOST:PORT[/NAMESPACE][?config=FILE], got {!r}"
+    "expected a server as grpc://HOST:PORT, http://HOST:PORT or "
+    "zenoh://HOST:PORT[/NAMESPACE][?config=FILE], got {!r}"
 )
 
 
@@ -22,6 +23,8 @@ def connector(server: str) -> Callable[[], Transport]:
     scheme, separator, address = server.rpartition("://")
     if scheme == ("grpc" if separator else "") and _is_place(address):
         return partial(GrpcTransport, address)
+    if scheme in ("http", "https") and _is_place(address):
+        return _http_connector(server)
     kind, _, link = scheme.partition("+")
     if kind == "zenoh":
         return _zenoh_connector(server, link or "tcp")
@@ -46,6 +49,16 @@ def _zenoh_connector(server: str, link: str) -> Callable[[], Transport]:
         parts.path.strip("/") or DEFAULT_NAMESPACE,
         Path(files[0]) if files else None,
     )
+
+
+def _http_connector(server: str) -> Callable[[], Transport]:
+    try:
+        from vergence.transports.http import HttpTransport
+    except ImportError:
+        raise ValueError(
+            f"{server} needs httpx, which is not installed here: pip install 'vergence[cli]'"
+        ) from None
+    return partial(HttpTransport, server)
 
 
 def _is_place(address: str) -> bool:

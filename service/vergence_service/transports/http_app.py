@@ -13,6 +13,7 @@ from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_l
 from pydantic.json_schema import models_json_schema
 
 from vergence_service.transports import PortTaken
+from vergence_service.transports.calls import OpenCalls
 from vergence_service.transports.http_errors import Problem, install_problems
 from vergence_service.transports.http_uploads import SequenceForm
 
@@ -93,11 +94,14 @@ class _Uvicorn(uvicorn.Server):
 class HttpServer:
     """Serves the app from the start of its context to its end. Raises PortTaken.
 
-    ``stopping`` is set before it waits for the answers that are being sent.
+    ``stopping`` is set before it waits for the answers that are being sent, and ``calls`` end.
     """
 
-    def __init__(self, app: FastAPI, *, host: str, port: int, stopping: asyncio.Event) -> None:
+    def __init__(
+        self, app: FastAPI, calls: OpenCalls, *, host: str, port: int, stopping: asyncio.Event
+    ) -> None:
         self._app = app
+        self._calls = calls
         self._address = (host, port)
         self._stopping = stopping
         self.port = port
@@ -122,6 +126,11 @@ class HttpServer:
 
     async def __aexit__(self, *exc_info: object) -> None:
         self._stopping.set()
+        await self._calls.drain(within_s=0)
         self._server.should_exit = True
         await self._task
         self._socket.close()
+
+    async def drain(self, *, within_s: float) -> None:
+        """Let calls end by themselves; after that, answer what they have sent and end them."""
+        await self._calls.drain(within_s=within_s)

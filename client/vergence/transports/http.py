@@ -1,0 +1,133 @@
+"""HTTP, for networks that let nothing else through: see :mod:`vergence_proto.http_records`."""
+
+from collections import deque
+from collections.abc import AsyncIterator
+
+import httpx
+from google.protobuf.message import Message
+
+from vergence.transports.base import Answer, Call, ConnectionLost
+from vergence_proto import codec
+from vergence_proto.errors import DepthError, NotReady, error_from_wire
+from vergence_proto.http_records import (
+    CALL_ID_HEADER,
+    PROTOBUF_TYPE,
+    RecordKind,
+    RecordReader,
+)
+from vergence_proto.keys import STREAM_ID_METADATA
+from vergence_proto.v1 import depth_pb2 as pb
+
+_HEADERS = {"Content-Type": PROTOBUF_TYPE}
+# A session pings every second, so even the long answer of a call is never silent for longer.
+_TIMEOUT_S = 10.0
+
+
+class HttpTransport:
+    """The :class:`~vergence.transports.base.Transport` to ``http://HOST:PORT`` (or https)."""
+
+    def __init__(self, base_url: str) -> None:
+        # Every call has two connections; how many there are is the session's affair.
+        limits = httpx.Limits(max_connections=None, max_keepalive_connections=None)
+        self._http = httpx.AsyncClient(base_url=base_url, limits=limits, timeout=_TIMEOUT_S)
+
+    async def open_call(self, stream_id: str) -> Call:
+        self._check_open()
+        return _HttpCall(self._http, stream_id)
+
+    async def ask(self, method: str, request: Message, answer: type[Answer]) -> Answer:
+        self._check_open()
+        content = request.SerializeToString()
+        try:
+            response = await self._http.post(
+                f"/v1/methods/{method}", content=content, headers=_HEADERS
+            )
+        except httpx.TransportError as error:
+            raise _lost(self._http, error) from None
+        if response.is_error:
+            raise _error_of(response)
+        return answer.FromString(response.content)
+
+    async def close(self) -> None:
+        await self._http.aclose()
+
+    def _check_open(self) -> None:
+        if self._http.is_closed:
+            raise ConnectionLost(f"the connection to {self._http.base_url} was closed")
+
+
+class _HttpCall:
+    def __init__(self, http: httpx.AsyncClient, stream_id: str) -> None:
+        self._http = http
+        self._headers = {**_HEADERS, STREAM_ID_METADATA: stream_id}
+        self._answer: httpx.Response | None = None
+        self._pieces: AsyncIterator[bytes]
+        self._reader = RecordReader()
+        self._records: deque[tuple[RecordKind, bytes]] = deque()
+        self._error: DepthError | None = None  # for receive to raise
+
+    async def send(self, request: pb.StreamDepthRequest) -> None:
+        content = request.SerializeToString()
+        try:
+            if self._answer is None:
+                await self._open(content)
+            elif self._error is None:
+                call_id = self._answer.headers[CALL_ID_HEADER]
+                # What is wrong with it is told by the call's own answer.
+                await self._http.post(
+                    f"/v1/streams/{call_id}", content=content, headers=self._headers
+                )
+        except httpx.TransportError as error:
+            self._error = _lost(self._http, error)
+
+    async def receive(self) -> pb.StreamDepthResponse | None:
+        if self._answer is None:
+            raise self._error or ConnectionLost("nothing was sent")
+        try:
+            while not self._records:
+                if self._error is not None:
+                    raise self._error
+                self._records.extend(self._reader.feed(await anext(self._pieces)))
+        except StopAsyncIteration:
+            raise ConnectionLost(f"{self._http.base_url} broke off its answer") from None
+        except (httpx.TransportError, httpx.StreamError) as error:
+            raise _lost(self._http, error) from None
+        kind, content = self._records.popleft()
+        if kind is RecordKind.MESSAGE:
+            return pb.StreamDepthResponse.FromString(content)
+        if content:
+            raise codec.error_from_frame_error(pb.FrameError.FromString(content))
+        return None
+
+    async def close(self) -> None:
+        if self._answer is not None:
+            await self._answer.aclose()
+
+    async def _open(self, content: bytes) -> None:
+        request = self._http.build_request(
+            "POST", "/v1/streams", content=content, headers=self._headers
+        )
+        answer = await self._http.send(request, stream=True)
+        if answer.is_error:
+            await answer.aread()
+            self._error = _error_of(answer)
+        self._answer = answer
+        self._pieces = answer.aiter_raw()
+
+
+def _lost(http: httpx.AsyncClient, error: Exception) -> ConnectionLost:
+    return ConnectionLost(f"no connection to {http.base_url} ({type(error).__name__}): {error}")
+
+
+def _error_of(response: httpx.Response) -> DepthError:
+    """The class the server raised, by its problem's reason; without one it is another server."""
+    if response.headers.get("Content-Type") == "application/problem+json":
+        problem = response.json()
+        if "reason" in problem:
+            retry_after = response.headers.get("Retry-After")
+            retry_after_s = None if retry_after is None else float(retry_after)
+            return error_from_wire(problem["reason"], problem["detail"], retry_after_s)
+    return NotReady(
+        f"{response.url} answered {response.status_code} {response.reason_phrase}: "
+        "it speaks HTTP but does not offer Vergence streams"
+    )
