@@ -39,9 +39,9 @@ from vergence_proto.model_io import (
 log = logging.getLogger("vergence_models.export")
 
 OPSET = 18  # ScatterElements gained reduction="max" there
-# PyTorch and onnxruntime sum in different orders; over three frames the recurrence and the choice
-# between two equal hypotheses enlarge that, but only here and there.
-PARITY_MEAN_PX = 2e-3
+# PyTorch and onnxruntime sum in different orders. Where two hypotheses are equally good that can tip
+# the choice, so a pixel here and there may differ by any amount; 99 of 100 must agree to this.
+PARITY_PX = 0.02
 
 
 class ParityError(RuntimeError):
@@ -112,19 +112,27 @@ def slim(path: Path) -> None:
     onnx.save(model, path)
 
 
-def shifted_pair(height: int, width: int, seed: int) -> tuple[NDArray[np.uint8], ...]:
-    """A textured pair, uint8 [1, H, W, 3], whose disparity grows from the top to the bottom."""
+def shifted_pair(
+    height: int, width: int, seed: int, *, pan_px: int = 0
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """A textured pair, uint8 [1, H, W, 3], whose disparity grows from the top to the bottom.
+
+    ``pan_px`` up to 40 looks so far to the right of where it looks by default.
+    """
     rng = np.random.default_rng(seed)
-    noise = rng.uniform(0, 255, (height // 4 + 1, width // 2 + 40, 3))
+    noise = rng.uniform(0, 255, (height // 4 + 1, width // 4 + 31, 3))
     wall = np.repeat(np.repeat(noise, 4, axis=0), 4, axis=1)[:height]
     shift = np.linspace(4, 40, height).astype(int)
-    left = wall[:, 40 : 40 + width]
-    right = np.stack([wall[y, 40 + s : 40 + s + width] for y, s in enumerate(shift)])
+    left = wall[:, pan_px : pan_px + width]
+    right = np.stack([wall[y, pan_px + s :][:width] for y, s in enumerate(shift)])
     return left[None].astype(np.uint8), right[None].astype(np.uint8)
 
 
 def check_parity(network: StereoNetwork, iterations: int, path: Path, *, frames: int = 3) -> float:
-    """The mean difference from PyTorch in px over a short sequence; raises ParityError if large."""
+    """How far 99 % of pixels are from PyTorch's over a short sequence, in px.
+
+    Raises ParityError if that is more than :data:`PARITY_PX`.
+    """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 2
     session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
@@ -132,10 +140,10 @@ def check_parity(network: StereoNetwork, iterations: int, path: Path, *, frames:
     state = network.cold_state(1, height, width)
     arrays = [tensor.numpy() for tensor in state]
     matrix = np.eye(4, dtype=np.float32)[None]
-    matrix[0, 0, 3] = 1.25  # the view moves
+    matrix[0, 0, 3] = -2.0  # the view pans
     worst = 0.0
     for frame in range(frames):
-        left, right = shifted_pair(height, width, frame)
+        left, right = shifted_pair(height, width, 0, pan_px=2 * frame)
         names = [node.name for node in session.get_inputs()]
         feed = dict(zip(names, [left, right, matrix, *arrays], strict=True))
         disparity, sigma, *arrays = session.run(None, feed)
@@ -147,12 +155,13 @@ def check_parity(network: StereoNetwork, iterations: int, path: Path, *, frames:
                 state,
                 iterations,
             )
-        difference = np.abs(disparity - estimate.disparity.numpy()).mean()
-        worst = max(worst, float(difference), float(np.abs(sigma - estimate.sigma.numpy()).mean()))
-    if not worst < PARITY_MEAN_PX:
+        for got, expected in ((disparity, estimate.disparity), (sigma, estimate.sigma)):
+            difference = np.abs(got - expected.numpy())
+            worst = max(worst, float(np.quantile(difference, 0.99)))
+    if not worst < PARITY_PX:
         raise ParityError(
-            f"{path}: differs from PyTorch by {worst:.2g} px on average, "
-            f"expected less than {PARITY_MEAN_PX:g}"
+            f"{path}: differs from PyTorch by {worst:.2g} px at the 99th percentile, "
+            f"expected less than {PARITY_PX:g}"
         )
     return worst
 
@@ -167,7 +176,7 @@ def export_run(run: Run, config: Config, out: Path) -> None:
         path = out / f"{config.name}_{iterations}.onnx"
         export_graph(network, iterations, path)
         worst = check_parity(network, iterations, path)
-        log.info("%s: differs from PyTorch by at most %.1e px on average", path.name, worst)
+        log.info("%s: 99 %% of pixels within %.1e px of PyTorch", path.name, worst)
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
         graphs[str(iterations)] = {"file": path.name, "sha256": digest}
     entry = {

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from vergence_models.config import NetworkConfig
 from vergence_models.evaluate import WEIGHTS
-from vergence_models.export import check_parity, export_graph, shifted_pair
+from vergence_models.export import PARITY_PX, check_parity, export_graph, shifted_pair
 from vergence_models.layers import all_pairs, banded, best_rival, lookup, lookup_row
 from vergence_models.network import State, StereoNetwork
 from vergence_models.stepping import OnnxNetwork
@@ -56,7 +56,7 @@ def test_the_graph_equals_pytorch_frame_by_frame(
     monkeypatch.setattr(logging.getLogger("torch.__trace"), "propagate", False)
     path = tmp_path / "lite_2.onnx"
     export_graph(network, 2, path)
-    assert check_parity(network, 2, path, frames=4) < 2e-3
+    assert check_parity(network, 2, path, frames=4) < PARITY_PX
 
 
 def test_rows_of_a_pytorch_batch_are_independent(network: StereoNetwork) -> None:
