@@ -14,7 +14,7 @@ class Drops:
     """
 
     at_source: int = 0  # submitted while as many as the credit allows were unanswered; never sent
-    displaced: int = 0  # a newer frame took their place before the model was free
+    displaced: int = 0  # a newer frame took their place in the server, or on a full network
     stale: int = 0  # older than their max_age_s when their turn came
     unread: int = 0  # their results came, and newer ones, before anybody read them
     lost: int = 0  # unanswered when the connection broke
