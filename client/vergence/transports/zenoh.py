@@ -49,6 +49,7 @@ class ZenohTransport:
         return call
 
     async def ask(self, method: str, request: Message, answer: type[Answer]) -> Answer:
+        """Of several servers that have an answer, the quickest's."""
         return next(iter((await self._ask_all(method, request, answer)).values()))
 
     async def close(self) -> None:
