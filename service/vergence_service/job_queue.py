@@ -4,9 +4,8 @@ import asyncio
 import logging
 import secrets
 import time
-from collections import Counter
-from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from collections.abc import AsyncIterator
+from contextlib import AbstractContextManager, asynccontextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Self
@@ -18,13 +17,12 @@ from vergence_proto.errors import (
     NotReady,
     QueueFull,
     SequenceNotDone,
-    UnknownSequence,
-    UploadTooLarge,
 )
 from vergence_proto.layouts import StereoSource
 from vergence_service.contents import check_folder
 from vergence_service.engine import DepthEngine
 from vergence_service.job_run import opening_of, run_job
+from vergence_service.job_shelf import JobShelf
 from vergence_service.jobs import (
     Job,
     JobOptions,
@@ -41,6 +39,8 @@ log = logging.getLogger(__name__)
 # A sequence that was running so often when the server died is taken to be the cause.
 _MAX_ATTEMPTS = 4
 _EXPIRE_EVERY_S = 30.0
+# Before trying again what the disk refused.
+_TROUBLE_PAUSE_S = 5.0
 # What a job is taken to need before one has run; clients are told to come back after it.
 _USUAL_JOB_S = 2.0
 
@@ -81,19 +81,16 @@ class JobQueue:
     def __init__(self, engine: DepthEngine, store: JobStore, *, limits: QueueLimits) -> None:
         self._engine = engine
         self._store = store
-        self._limits = limits
-        self._jobs: dict[str, Job] = {}  # as the store has them, oldest first
+        self._max_waiting = limits.waiting
+        self._shelf = JobShelf(store, keep_s=limits.keep_s, disk_bytes=limits.disk_bytes)
         self._running: dict[str, _Running] = {}  # at most one is stepped, one is being put away
         self._leaving = False  # the server is shutting down
         self._last_job_s = _USUAL_JOB_S
         self._uploads = 0
-        self._readers: Counter[str] = Counter()  # of results, which stay until they are read
         self._tasks: list[asyncio.Task[None]] = []
-        self._changed = asyncio.Condition()
 
     async def __aenter__(self) -> Self:
-        jobs = await asyncio.to_thread(self._store.load)
-        self._jobs = {job.job_id: job for job in jobs}
+        await self._shelf.load()
         return self
 
     async def __aexit__(self, *exc_info: object) -> None:
@@ -114,9 +111,9 @@ class JobQueue:
 
         Raises QueueFull.
         """
-        if self._waiting_count() + self._uploads >= self._limits.waiting:
+        if len(self._shelf.unfinished()) + self._uploads >= self._max_waiting:
             raise QueueFull(
-                f"{self._limits.waiting} sequences are waiting, as many as may; try again later",
+                f"{self._max_waiting} sequences are waiting, as many as may; try again later",
                 retry_after_s=self._usual_job_s(),
             )
         self._uploads += 1
@@ -137,7 +134,7 @@ class JobQueue:
         """
         limit = self._engine.max_pixels
         spec, source = await asyncio.to_thread(_find, folder / "input", wanted, max_pixels=limit)
-        await self._engine.open_apart(opening_of(source.rig, options))  # for its refusals
+        await self._engine.open_apart(opening_of(source, options))  # for its refusals
         uploaded = await asyncio.to_thread(folder_bytes, folder)
         job = Job(
             job_id=secrets.token_hex(8),
@@ -148,19 +145,17 @@ class JobQueue:
             options=options,
             disk_bytes=uploaded + _result_bytes(source, options),
         )
-        await self._make_room(job.disk_bytes)
-        await asyncio.to_thread(self._store.accept, folder, job)
-        self._jobs[job.job_id] = job
-        await self._tell()
+        await self._shelf.make_room(job.disk_bytes, retry_after_s=self._usual_job_s())
+        await self._shelf.accept(folder, job)
         return self.status(job.job_id)
 
     def status(self, job_id: str) -> JobStatus:
         """Raises UnknownSequence."""
-        job = self._get(job_id)
+        job = self._shelf.get(job_id)
         running = self._running.get(job_id)
         if job.ended or running is None:
             done = job.frames if job.state is JobState.DONE else 0
-            ahead = 0 if job.ended else self._ahead(job)
+            ahead = 0 if job.ended else self._shelf.unfinished().index(job)
             return JobStatus(job, done, ahead, job.fps, None)
         fps = running.frames_done / max(time.monotonic() - running.since_s, 1e-6)
         left = job.frames - running.frames_done
@@ -168,58 +163,47 @@ class JobQueue:
 
     def statuses(self) -> list[JobStatus]:
         """Of all jobs, oldest first."""
-        return [self.status(job_id) for job_id in self._jobs]
+        return [self.status(job.job_id) for job in self._shelf]
 
     async def change(self, *, within_s: float) -> None:
         """Wait until a job begins, ends or is deleted, but not for longer than ``within_s``."""
-        async with self._changed:
-            try:
-                await asyncio.wait_for(self._changed.wait(), within_s)
-            except TimeoutError:
-                return
+        await self._shelf.change(within_s=within_s)
 
     async def delete(self, job_id: str) -> None:
         """Stop the job if it has not ended, and remove all that it has. Raises UnknownSequence."""
-        self._get(job_id)
-        del self._jobs[job_id]
+        self._shelf.forget(job_id)
         running = self._running.get(job_id)
         if running is not None and running.task is not None:
             running.task.cancel()
             await asyncio.gather(running.task, return_exceptions=True)
-        await asyncio.to_thread(self._store.delete, job_id)
-        await self._tell()
+        await self._shelf.remove(job_id)
 
     def result(self, job_id: str) -> tuple[Job, Path]:
         """A job that is done, and the folder of its result.
 
         Raises UnknownSequence, SequenceNotDone.
         """
-        job = self._get(job_id)
+        job = self._shelf.get(job_id)
         if job.state is not JobState.DONE:
             failure = f": {job.reason}: {job.message}" if job.state is JobState.FAILED else ""
             raise SequenceNotDone(
                 f"sequence {job_id} has no result, it is {job.state}{failure}",
                 retry_after_s=None if job.ended else self._usual_job_s(),
             )
-        return job, self._store.folder(job_id) / "result"
+        return job, self._shelf.folder(job_id) / "result"
 
-    @contextmanager
-    def reading(self, job_id: str) -> Iterator[None]:
+    def reading(self, job_id: str) -> AbstractContextManager[None]:
         """The job's result does not expire before the block ends."""
-        self._readers[job_id] += 1
-        try:
-            yield
-        finally:
-            self._readers[job_id] -= 1
+        return self._shelf.reading(job_id)
 
     async def _run_all(self) -> None:
         async with asyncio.TaskGroup() as tasks:
             before: asyncio.Task[None] | None = None
             while not self._leaving:
-                waiting = (job for job in self._jobs.values() if not job.ended)
-                job = next((job for job in waiting if job.job_id not in self._running), None)
+                waiting = self._shelf.unfinished()
+                job = next((each for each in waiting if each.job_id not in self._running), None)
                 if job is None:
-                    await self.change(within_s=_EXPIRE_EVERY_S)
+                    await self._shelf.change(within_s=_EXPIRE_EVERY_S)
                     continue
                 running = self._running[job.job_id] = _Running(time.monotonic())
                 name = f"sequence {job.job_id}"
@@ -237,9 +221,12 @@ class JobQueue:
             finally:
                 self._last_job_s = time.monotonic() - running.since_s
                 running.stepped.set()
-            await self._end(ended)
+            await self._shelf.put_away(ended)
         except (Draining, NotReady):
             self._leaving = True
+        except Exception:  # a full disk, most likely: the job keeps its place
+            log.exception("the state of sequence %s could not be kept", job.job_id)
+            await asyncio.sleep(_TROUBLE_PAUSE_S)
         finally:
             del self._running[job.job_id]
 
@@ -250,17 +237,17 @@ class JobQueue:
                 job, ModelFailed(f"the server died {job.attempts} times while it ran this sequence")
             )
         started = replace(job, state=JobState.RUNNING, attempts=job.attempts + 1)
-        await self._publish(started)
+        await self._shelf.update(started)
 
         def count_frame() -> None:
             running.frames_done += 1
 
         try:
-            folder = self._store.folder(job.job_id)
+            folder = self._shelf.folder(job.job_id)
             found = await run_job(self._engine, folder, started, count_frame)
         except (Draining, NotReady, asyncio.CancelledError):
             # Not the sequence's doing: it keeps its place, for this server or the next one.
-            await self._publish(replace(job, state=JobState.QUEUED))
+            await self._shelf.update(replace(job, state=JobState.QUEUED))
             raise
         except DepthError as error:
             return _failed(started, error)
@@ -271,75 +258,10 @@ class JobQueue:
         accuracy = None if found is None else asdict(found)
         return replace(started, state=JobState.DONE, fps=fps, accuracy=accuracy)
 
-    async def _end(self, job: Job) -> None:
-        result = self._store.folder(job.job_id) / "result"
-        done = job.state is JobState.DONE
-        taken = await asyncio.to_thread(folder_bytes, result) if done else 0
-        job = replace(job, finished_s=time.time(), disk_bytes=taken)
-        await self._publish(job)
-        # Only now: a server that is killed before the row says so needs the input again.
-        await asyncio.to_thread(self._store.tidy, job)
-
-    async def _publish(self, job: Job) -> None:
-        await asyncio.to_thread(self._store.update, job)
-        if job.job_id in self._jobs:
-            self._jobs[job.job_id] = job
-            await self._tell()
-
-    async def _tell(self) -> None:
-        async with self._changed:
-            self._changed.notify_all()
-
     async def _expire_now_and_then(self) -> None:
         while True:
-            await self._expire(time.time() - self._limits.keep_s)
+            await self._shelf.expire()
             await asyncio.sleep(_EXPIRE_EVERY_S)
-
-    async def _expire(self, before_s: float) -> None:
-        for job in list(self._jobs.values()):
-            if job.finished_s is not None and job.finished_s < before_s and self._unread(job):
-                await self.delete(job.job_id)
-
-    async def _make_room(self, needed_bytes: int) -> None:
-        """Let the oldest results go until a new job fits. Raises QueueFull, UploadTooLarge."""
-        if needed_bytes > self._limits.disk_bytes:
-            raise UploadTooLarge(
-                f"the sequence and its result take {needed_bytes} bytes, the server keeps "
-                f"{self._limits.disk_bytes} for all; send it in parts"
-            )
-        for job in sorted(self._jobs.values(), key=lambda job: job.finished_s or 0):
-            if self._taken_bytes() + needed_bytes <= self._limits.disk_bytes:
-                return
-            if job.ended and self._unread(job):
-                await self.delete(job.job_id)
-        if self._taken_bytes() + needed_bytes > self._limits.disk_bytes:
-            raise QueueFull(
-                f"the sequences that wait take {self._taken_bytes()} of "
-                f"{self._limits.disk_bytes} bytes on disk, this one needs {needed_bytes}; try "
-                "again later",
-                retry_after_s=self._usual_job_s(),
-            )
-
-    def _get(self, job_id: str) -> Job:
-        if job_id not in self._jobs:
-            raise UnknownSequence(
-                f"no sequence {job_id[:64]!r}: it never was, was deleted, or its result expired, "
-                f"{self._limits.keep_s / 3600:g} h after its end or when disk space ran short"
-            )
-        return self._jobs[job_id]
-
-    def _ahead(self, job: Job) -> int:
-        unfinished = [each.job_id for each in self._jobs.values() if not each.ended]
-        return unfinished.index(job.job_id)
-
-    def _waiting_count(self) -> int:
-        return sum(not job.ended for job in self._jobs.values())
-
-    def _unread(self, job: Job) -> bool:
-        return self._readers[job.job_id] == 0
-
-    def _taken_bytes(self) -> int:
-        return sum(job.disk_bytes for job in self._jobs.values())
 
     def _usual_job_s(self) -> float:
         """How long until a place is free, as far as anybody can tell."""

@@ -7,8 +7,8 @@ from contextlib import aclosing
 from pathlib import Path
 
 from vergence_proto.accuracy import Accuracy, accuracy
-from vergence_proto.layouts import LayoutError
-from vergence_proto.types import Delivery, OutputFormat, StereoRig
+from vergence_proto.layouts import LayoutError, StereoSource
+from vergence_proto.types import Delivery, OutputFormat
 from vergence_service.engine import DepthEngine
 from vergence_service.jobs import Job, JobOptions, Output
 from vergence_service.results import start_result, write_frame
@@ -25,14 +25,18 @@ from vergence_service.streams import Opening
 _UNWRITTEN = 2
 
 
-def opening_of(rig: StereoRig, options: JobOptions) -> Opening:
-    """How a sequence is stepped; lossless, so it gives way to live streams."""
+def opening_of(source: StereoSource, options: JobOptions) -> Opening:
+    """How a sequence is stepped; lossless, so it gives way to live streams.
+
+    The iterations of a lone pair are those of its cold start, as in ``vergence run``.
+    """
+    alone = source.fps is None and len(source) == 1
     return Opening(
-        rig,
+        source.rig,
         delivery=Delivery.EVERY,
         output=OutputFormat(confidence=Output.CONFIDENCE in options.outputs),
         iterations=options.iterations,
-        cold_iterations=options.iterations,
+        cold_iterations=options.iterations if alone else 0,
     )
 
 
@@ -57,7 +61,7 @@ async def run_job(
         on_frame()
 
     try:
-        async with aclosing(step_all(engine, source, opening_of(source.rig, job.options))) as steps:
+        async with aclosing(step_all(engine, source, opening_of(source, job.options))) as steps:
             async for stepped in steps:
                 if stepped.index == 0:
                     rig = stepped.disparity.rig

@@ -14,11 +14,10 @@ from pydantic import BaseModel, ConfigDict, Field
 from vergence_proto.errors import BadCalibration, BadImage, BadShape, FrameTooLarge
 from vergence_proto.geometry import RectifiedRig
 from vergence_proto.layouts import LayoutError, encode_disparity_png, read_image
-from vergence_proto.types import Image, Plane, StereoFrame, StereoRig
+from vergence_proto.types import Delivery, Image, Plane, StereoFrame, StereoRig
 from vergence_service.contents import check_file
 from vergence_service.engine import DepthEngine
-from vergence_service.job_run import opening_of
-from vergence_service.jobs import JobOptions
+from vergence_service.streams import Opening
 from vergence_service.transports.http_errors import PROBLEM_RESPONSE
 from vergence_service.transports.http_uploads import (
     FORM_TYPE,
@@ -98,8 +97,12 @@ def pair_routes(engine: DepthEngine, *, limits: UploadLimits) -> APIRouter:
         )
         if query.output is PairOutput.DEPTH and not (query.fx_px and query.baseline_m):
             raise BadCalibration("depth needs fx_px and baseline_m; without them take disparity")
-        options = JobOptions(iterations=query.iterations)
-        stream = await engine.open_apart(opening_of(StereoRig.from_rectified(rig), options))
+        opening = Opening(
+            StereoRig.from_rectified(rig),
+            delivery=Delivery.EVERY,
+            cold_iterations=query.iterations,
+        )
+        stream = await engine.open_apart(opening)
         frame = StereoFrame(1, 0, left, right)
         disparity = await engine.step_apart(stream, lambda: frame)
         wanted = disparity.depth_m if query.output is PairOutput.DEPTH else disparity.disparity_px
