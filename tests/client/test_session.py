@@ -288,7 +288,7 @@ async def test_what_no_server_would_take_is_refused_before_it_is_sent(client: De
             client.open_session(RIG, stream_id=stream_id)
 
 
-@pytest.mark.parametrize("server", ["http://host:80", "host", ":50051", "grpc://", "host:port"])
+@pytest.mark.parametrize("server", ["ftp://host:80", "host", ":50051", "grpc://", "host:port"])
 def test_a_server_that_is_none_is_refused_by_its_spelling(server: str) -> None:
     with pytest.raises(ValueError, match=r"grpc://HOST:PORT"):
         DepthClient(server)
