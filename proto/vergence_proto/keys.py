@@ -20,6 +20,9 @@ client to a stream, from its open on, carries the attachment's id as Zenoh attac
 an earlier one left on the way is told apart. A client is bound by its credit, and numbers the
 frames it sends without a gap: what is missing was lost on the way, and is answered as dropped.
 
+All go with real-time priority, so that none overtakes another; live frames, and the answers to
+them, are dropped where the way is full (congestion DROP), everything else waits (BLOCK).
+
 A chunk that begins with @ is matched by no wildcard, and no stream id has one.
 """
 
