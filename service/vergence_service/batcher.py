@@ -32,13 +32,17 @@ class _Waiting:
     step: Step
     since_s: float
     deadline_s: float | None
-    live: bool
+    live_stream: str | None
     answer: asyncio.Future[TimedResult]
 
     @property
     def shape_of_work(self) -> tuple[object, ...]:
         """Rows can share a batch if this is equal."""
         return self.live, self.step.view.left.shape, self.step.iterations
+
+    @property
+    def live(self) -> bool:
+        return self.live_stream is not None
 
 
 class StepBatcher:
@@ -93,8 +97,7 @@ class StepBatcher:
         """
         now_s = self._clock()
         answer: asyncio.Future[TimedResult] = asyncio.get_running_loop().create_future()
-        live = live_stream is not None
-        self._waiting.append(_Waiting(step, now_s, deadline_s, live, answer))
+        self._waiting.append(_Waiting(step, now_s, deadline_s, live_stream, answer))
         if live_stream is not None:
             self._rhythm.arrived(live_stream, now_s)
         self._arrived.set()
@@ -121,7 +124,9 @@ class StepBatcher:
         due = None if first.live else self._rhythm.next_due(now_s)
         if due is None or now_s - first.since_s > _PATIENCE_S:
             return 0.0
-        ends_s = now_s + self._work_s.get(first.shape_of_work, 0.0)
+        # What was never seen is taken to be as long as the longest that was.
+        longest_s = max(self._work_s.values(), default=0.0)
+        ends_s = now_s + self._work_s.get(first.shape_of_work, longest_s)
         return due.until_s - now_s if ends_s > due.at_s else 0.0
 
     async def _next_arrival(self, *, within_s: float) -> None:
@@ -167,6 +172,8 @@ class StepBatcher:
         self._work_s[batch[0].shape_of_work] = model_s
         self._metrics.batch_size.observe(len(batch))
         for item, result in zip(batch, results, strict=True):
+            if item.live_stream is not None:
+                self._rhythm.answered(item.live_stream, started_s + model_s)
             if not item.answer.done():
                 queue_s = started_s - item.since_s
                 item.answer.set_result(TimedResult(result, queue_s, model_s))

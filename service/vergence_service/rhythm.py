@@ -12,7 +12,8 @@ _SMOOTHING = 0.2
 
 @dataclass(slots=True)
 class _Beat:
-    last_s: float
+    last_s: float  # when its last frame came
+    answered_s: float  # when that was answered; until then no other can come
     interval_s: float | None = None  # None: only one frame has come
 
 
@@ -34,11 +35,15 @@ class LiveRhythm:
         beat = self._beats.get(stream_id)
         interval_s = 0.0 if beat is None else now_s - beat.last_s
         if beat is None or interval_s > _LONGEST_S:
-            self._beats[stream_id] = _Beat(now_s)
+            self._beats[stream_id] = _Beat(now_s, now_s)
             return
         known_s = beat.interval_s or interval_s
         beat.interval_s = known_s + _SMOOTHING * (interval_s - known_s)
         beat.last_s = now_s
+
+    def answered(self, stream_id: str, now_s: float) -> None:
+        if stream_id in self._beats:
+            self._beats[stream_id].answered_s = now_s
 
     def next_due(self, now_s: float) -> Due | None:
         """The live frame that is expected first; None if none is, or none has a rhythm."""
@@ -48,7 +53,7 @@ class LiveRhythm:
                 del self._beats[stream_id]
             elif beat.interval_s:
                 at_s = beat.last_s + beat.interval_s
-                until_s = at_s + _LATE * beat.interval_s
+                until_s = max(at_s, beat.answered_s) + _LATE * beat.interval_s
                 if now_s < until_s and (found is None or at_s < found.at_s):
                     found = Due(at_s, until_s)
         return found

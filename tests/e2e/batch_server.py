@@ -1,9 +1,10 @@
-"""A server to be killed: ``python -m`` this module, the folder of its jobs, seconds of a step."""
+"""A server to be killed: ``python -m`` this module, its jobs' folder, seconds of a step, port."""
 
 import asyncio
 import sys
 import time
 from collections.abc import Sequence
+from typing import Any
 
 from tests.support.models import RecallModel
 from tests.support.server import running_server
@@ -20,11 +21,12 @@ class PacedModel(RecallModel):
         return super().step(steps)
 
 
-async def _serve(directory: str, step_s: float) -> None:
-    async with running_server(PacedModel(step_s), batch__directory=directory) as server:
+async def _serve(directory: str, step_s: float, port: int) -> None:
+    flags: dict[str, Any] = {"batch__directory": directory, "http__port": port}
+    async with running_server(PacedModel(step_s), **flags) as server:
         print(server.http_address, flush=True)  # noqa: T201  the parent reads it
         await asyncio.to_thread(sys.stdin.read)  # until the parent closes its end
 
 
 if __name__ == "__main__":
-    asyncio.run(_serve(sys.argv[1], float(sys.argv[2])))
+    asyncio.run(_serve(sys.argv[1], float(sys.argv[2]), int(sys.argv[3])))

@@ -1,6 +1,9 @@
 """An accepted sequence is done, whatever happens to the process in between."""
 
 import asyncio
+import io
+import json
+import socket
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -8,11 +11,13 @@ from pathlib import Path
 
 import httpx
 import numpy as np
+from rich.console import Console
 
 from tests.support.http import disparities, ended, files_below, http_server, submit
 from tests.support.models import RecallModel
-from tests.support.sequences import make_frames, sequence_files, zip_bytes
+from tests.support.sequences import make_frames, sequence_files, write_sequence, zip_bytes
 from tests.support.server import PATIENCE_S
+from vergence.cli.batch import batch
 
 REPOSITORY = Path(__file__).parents[2]
 ARCHIVES = [zip_bytes(sequence_files(make_frames(5, brightness=10 * n))) for n in range(1, 21)]
@@ -20,11 +25,11 @@ ARCHIVES = [zip_bytes(sequence_files(make_frames(5, brightness=10 * n))) for n i
 
 @asynccontextmanager
 async def killed_server(
-    directory: Path, *, step_s: float = 0.0
+    directory: Path, *, step_s: float = 0.0, port: int = 0
 ) -> AsyncIterator[httpx.AsyncClient]:
     """A server in a process of its own, which ends by SIGKILL."""
     process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "tests.e2e.batch_server", str(directory), str(step_s)),
+        *(sys.executable, "-m", "tests.e2e.batch_server", str(directory), str(step_s), str(port)),
         cwd=REPOSITORY,
         stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.PIPE,
@@ -61,3 +66,35 @@ async def test_a_killed_server_finishes_all_that_it_accepted(tmp_path: Path) -> 
             job = await submit(client, archive)
             await ended(client, job["id"])
             np.testing.assert_array_equal(maps, await disparities(client, job["id"]))
+
+
+async def test_a_batch_goes_on_when_its_server_is_killed_and_comes_back(tmp_path: Path) -> None:
+    rooms = [
+        write_sequence(tmp_path / f"room-{n}", make_frames(4, brightness=10 * n))
+        for n in range(1, 6)
+    ]
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    going = asyncio.create_task(
+        batch(
+            rooms,
+            server=f"http://127.0.0.1:{port}",
+            out=tmp_path / "out",
+            form="npz",
+            query={},
+            json=tmp_path / "batch.json",
+            console=Console(file=io.StringIO()),
+        )
+    )
+    async with killed_server(tmp_path / "jobs", step_s=0.04, port=port) as client:
+        async with asyncio.timeout(PATIENCE_S):
+            while not (await client.get("/v1/sequences")).json():  # noqa: ASYNC110  as clients wait
+                await asyncio.sleep(0.01)
+    assert not going.done()
+    async with killed_server(tmp_path / "jobs", port=port):
+        await asyncio.wait_for(going, PATIENCE_S)
+    figures = json.loads((tmp_path / "batch.json").read_text())
+    assert (figures["failed"], figures["frames"]) == (0, 20)
+    for room in rooms:
+        assert len(list((tmp_path / "out" / room.name).glob("*.npz"))) == 4

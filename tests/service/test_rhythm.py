@@ -103,3 +103,5 @@ def test_a_rhythm_is_learned_and_forgotten() -> None:
     assert rhythm.next_due(1.6) == Due(1.6 + (1.6 - 1.5), 1.6 + 1.5 * (1.6 - 1.5))
     assert rhythm.next_due(1.9) == Due(2.0, 2.25), "b has stopped"
     assert rhythm.next_due(2.3) is None, "both have"
+    rhythm.answered("a", 2.4)
+    assert rhythm.next_due(2.4) == Due(2.0, 2.65), "a was kept waiting and could not send"

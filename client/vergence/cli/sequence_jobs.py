@@ -63,15 +63,22 @@ class SequenceService:
         """The result of a job: a folder of files, or a film."""
         target.parent.mkdir(parents=True, exist_ok=True)
         film = form == "mp4"
-        file = target.with_suffix(".mp4" if film else ".zip.part")
+        file = target.with_name(target.name + (".mp4" if film else ".zip.part"))
         url = f"/v1/sequences/{job['id']}/result"
-        async with self.http.stream("GET", url, params={"format": form}) as answer:
-            if answer.status_code != 200:
-                await answer.aread()
-                raise _error_of(answer)
-            with file.open("wb") as sink:
-                async for chunk in answer.aiter_bytes(_CHUNK):
-                    await asyncio.to_thread(sink.write, chunk)
+
+        async def download() -> httpx.Response:
+            async with self.http.stream("GET", url, params={"format": form}) as answer:
+                if answer.is_error:
+                    await answer.aread()
+                    return answer
+                with file.open("wb") as sink:
+                    async for chunk in answer.aiter_bytes(_CHUNK):
+                        await asyncio.to_thread(sink.write, chunk)
+            return answer
+
+        answer = await self._patiently(download)
+        if answer.is_error:
+            raise _error_of(answer)
         if not film:
             await asyncio.to_thread(_unpack, file, target)
 
