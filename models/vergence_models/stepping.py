@@ -110,7 +110,7 @@ class OnnxNetwork:
         }
 
     def cold_state(self, height: int, width: int, batch: int = 1) -> State:
-        """All zeros, for images of a size that the stride divides."""
+        """All zeros, for images of a size that ``card.step_size`` gives."""
         return tuple(
             np.zeros((batch, *tensor.shape(height, width)), np.float32)
             for tensor in self.card.state
@@ -141,12 +141,11 @@ class OnnxNetwork:
 
         ``warm=None`` carries no state: every frame starts cold. No pose is no motion.
         """
-        stride = self.card.stride
         state: State | None = None
         previous: Pose | None = None
         for view in footage.views:
             height, width = view.left.shape[:2]
-            left, right = (padded(image, stride)[None] for image in (view.left, view.right))
+            left, right = (grown(image, self.card)[None] for image in (view.left, view.right))
             matrix = np.eye(4, dtype=np.float32)
             if state is None or warm is None:
                 state, count = self.cold_state(*left.shape[1:3]), cold
@@ -160,7 +159,9 @@ class OnnxNetwork:
             yield Prediction(disparity[0, :height, :width], sigma[0, :height, :width])
 
 
-def padded(image: Image, stride: int) -> Image:
+def grown(image: Image, card: ModelCard) -> Image:
     """Grown at the right and the bottom, edges repeated: pixel coordinates stay as they are."""
     height, width = image.shape[:2]
-    return np.pad(image, ((0, -height % stride), (0, -width % stride), (0, 0)), mode="edge")
+    step_height, step_width = card.step_size(height, width)
+    around = ((0, step_height - height), (0, step_width - width), (0, 0))
+    return np.pad(image, around, mode="edge")

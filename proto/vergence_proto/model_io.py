@@ -5,7 +5,7 @@ that describes them. One run of a graph is one step of the recurrence, for a bat
 
 Inputs:
 
-- ``left``, ``right``: uint8 [B, H, W, 3], rectified RGB; H and W are multiples of the stride.
+- ``left``, ``right``: uint8 [B, H, W, 3], rectified RGB; H and W as :meth:`ModelCard.step_size`.
 - ``uvd_curr_from_prev``: float32 [B, 4, 4], pixels of the previous frame to pixels of this one;
   see :func:`vergence_proto.geometry.uvd_curr_from_prev`.
 - ``prev_<tensor>``: float32 [B, C, h, w], the state the previous step left; zeros on a cold start.
@@ -70,6 +70,14 @@ class ModelCard:
     state: tuple[StateTensor, ...]  # in the order of the graph's inputs
     graphs: Mapping[int, Path]  # iterations -> file
     weights_sha256: str  # of all graphs together: the identity told to clients
+
+    def step_size(self, height: int, width: int) -> tuple[int, int]:
+        """The size [H, W] that images are grown to: whole strides, every disparity inside."""
+        rows, columns = (
+            -(-height // self.stride),
+            -(-max(width, self.max_disparity_px) // self.stride),
+        )
+        return rows * self.stride, columns * self.stride
 
     def iterations_at_most(self, wanted: int) -> int:
         """The largest exported count that does not exceed ``wanted`` (at least the smallest)."""

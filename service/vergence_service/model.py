@@ -209,10 +209,10 @@ class OnnxStereoModel:
         ]
 
     def _feeds(self, steps: Sequence[Step]) -> dict[str, NDArray[np.generic]]:
-        left = _stack([_padded(step.view.left, self._card.stride) for step in steps])
+        left = _stack([_grown(step.view.left, self._card) for step in steps])
         feeds: dict[str, NDArray[np.generic]] = {
             LEFT: left,
-            RIGHT: _stack([_padded(step.view.right, self._card.stride) for step in steps]),
+            RIGHT: _stack([_grown(step.view.right, self._card) for step in steps]),
             UVD_CURR_FROM_PREV: _stack([step.uvd_curr_from_prev for step in steps]),
         }
         for index, tensor in enumerate(self._card.state):
@@ -240,7 +240,7 @@ class OnnxStereoModel:
 
 def state_bytes(card: ModelCard, height: int, width: int) -> int:
     """The memory that one stream's state takes."""
-    height, width = (-(-size // card.stride) * card.stride for size in (height, width))
+    height, width = card.step_size(height, width)
     return sum(4 * int(np.prod(tensor.shape(height, width))) for tensor in card.state)
 
 
@@ -271,9 +271,11 @@ def _stack(rows: Sequence[NDArray[np.generic]]) -> NDArray[np.generic]:
     return np.ascontiguousarray(rows[0])[None] if len(rows) == 1 else np.stack(rows)
 
 
-def _padded(image: Image, stride: int) -> Image:
+def _grown(image: Image, card: ModelCard) -> Image:
     """Edges repeated to the right and below, where they move no pixel coordinate."""
-    below, right = (-size % stride for size in image.shape[:2])
-    if not (below or right):
+    height, width = image.shape[:2]
+    step_height, step_width = card.step_size(height, width)
+    if (step_height, step_width) == (height, width):
         return image
-    return np.pad(image, ((0, below), (0, right), (0, 0)), mode="edge")
+    around = ((0, step_height - height), (0, step_width - width), (0, 0))
+    return np.pad(image, around, mode="edge")

@@ -103,10 +103,22 @@ def test_any_size_is_served_at_its_size(model: OnnxStereoModel) -> None:
     assert result.state.nbytes == state_bytes(model.card, RIG.height, RIG.width)
 
 
+@pytest.mark.parametrize("size", [(1, 1), (48, 64), (32, 192)], ids=str)
+def test_images_narrower_than_the_largest_disparity_are_served(
+    model: OnnxStereoModel, size: tuple[int, int]
+) -> None:
+    view = make_view(1, 8)
+    height, width = size
+    small = View(view.left[:height, :width], view.right[:height, :width], RIG, 1)
+    [result] = model.step([Step(small, None, 1)])
+    assert result.offset_px.shape == size
+
+
 def test_padding_is_the_edge_repeated(model: OnnxStereoModel) -> None:
     view = make_view(1, 9)
-    stride = model.card.stride
-    height, width = (-(-size // stride) * stride for size in (RIG.height, RIG.width))
+    height, width = model.card.step_size(RIG.height, RIG.width)
+    assert height > RIG.height
+    assert width > RIG.width
     around = ((0, height - RIG.height), (0, width - RIG.width), (0, 0))
     left, right = (np.pad(image, around, mode="edge") for image in (view.left, view.right))
     padded = View(left, right, RIG, view.capture_ns, view.world_from_left)
