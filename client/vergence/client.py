@@ -24,10 +24,10 @@ class DepthClient:
     """A connection to a server; connects when it is first needed.
 
     ``server`` is ``grpc://HOST:PORT``, or ``zenoh://HOST:PORT[/NAMESPACE][?config=FILE]`` with the
-    place of a Zenoh router, of which a server can be one; anything else is a ValueError. Every
-    method raises NotReady (ConnectionLost) where the server cannot be reached, and otherwise the
-    class of :mod:`vergence_proto.errors` that the server raised. Use it inside ``async with``, from
-    one event loop.
+    place of a Zenoh router, of which a server can be one, or ``http://HOST:PORT`` where nothing
+    else gets through; anything else is a ValueError. Every method raises NotReady (ConnectionLost)
+    where the server cannot be reached, and otherwise the class of :mod:`vergence_proto.errors` that
+    the server raised. Use it inside ``async with``, from one event loop.
     """
 
     def __init__(self, server: str = DEFAULT_SERVER) -> None:
