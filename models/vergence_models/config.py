@@ -16,9 +16,7 @@ class NetworkConfig:
 
     max_disparity_px: int = 192
     stride: int = 32  # H and W are multiples of it
-    fine_bits: int = (
-        16  # census comparisons per cell at 1/4 (48 would be 1 % better)
-    )
+    fine_bits: int = 16  # census comparisons per cell at 1/4 (48 would be 1 % better)
     coarse_bits: int = 48  # census comparisons per cell at 1/8, from the quarter-size image
     context_quarter: int = 32
     context_eighth: int = 48
