@@ -24,7 +24,7 @@ def as_it_is(context: schemathesis.SerializationContext, content: bytes) -> byte
     return content
 
 
-EXAMPLES = 20  # of every operation
+EXAMPLES = 12  # of every operation
 
 Case = schemathesis.Case[Any]
 
