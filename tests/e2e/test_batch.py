@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from tests.e2e.test_commands import vergence
+from tests.e2e.wall import write_wall
 from tests.support.http import http_server
 from tests.support.models import NOT_FINITE, RecallModel
 from tests.support.sequences import make_frames, sequence_files, write_sequence, zip_bytes
@@ -84,3 +86,14 @@ async def test_what_holds_no_sequence_is_told_before_anything_is_sent(
     (tmp_path / "text.txt").write_text("hello")
     with pytest.raises(Trouble, match=name):
         await run([tmp_path / name], "127.0.0.1:1", tmp_path / "out")
+
+
+def test_the_command_starts_a_server_of_its_own_and_writes_pictures(tmp_path: Path) -> None:
+    wall = write_wall(tmp_path / "wall", frames=2)
+    outputs = ("--output", "disparity", "--output", "depth", "--metrics")
+    done = vergence("batch", wall, "--out", tmp_path / "out", *outputs)
+    assert done.returncode == 0, done.stderr
+    assert "wall" in done.stdout
+    for kind in ("disparity", "depth"):
+        names = [path.name for path in sorted((tmp_path / "out" / "wall" / kind).iterdir())]
+        assert names == ["0000.png", "0001.png"]
