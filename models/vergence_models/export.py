@@ -39,8 +39,8 @@ from vergence_proto.model_io import (
 log = logging.getLogger("vergence_models.export")
 
 OPSET = 18  # ScatterElements gained reduction="max" there
-# PyTorch and onnxruntime sum in different orders. Where two hypotheses are equally good that can tip
-# the choice, so a pixel here and there may differ by any amount; 99 of 100 must agree to this.
+# PyTorch and onnxruntime sum in different orders. Where two hypotheses are equally good that can
+# tip the choice, so a pixel here and there may differ by any amount; 99 of 100 must agree to this.
 PARITY_PX = 0.02
 
 

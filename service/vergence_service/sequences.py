@@ -3,7 +3,7 @@
 import asyncio
 import dataclasses
 from collections import deque
-from collections.abc import AsyncGenerator, Iterator
+from collections.abc import AsyncGenerator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from vergence_proto.layouts import (
     StereoSource,
     find_sources,
     open_source,
+    read_ahead,
 )
 from vergence_proto.types import DisparityMap
 from vergence_service.engine import DepthEngine
@@ -42,7 +43,7 @@ async def step_all(
     Raises what DepthEngine.open_apart and step_apart raise; LayoutError: a file cannot be read.
     """
     stream = await engine.open_apart(opening)
-    frames = _read_ahead(source)
+    frames = read_ahead(source)
     waiting: deque[asyncio.Task[Stepped]] = deque()
     try:
         async for index, frame in frames:
@@ -59,20 +60,6 @@ async def step_all(
 
 async def _step(engine: DepthEngine, stream: Stream, index: int, source: SourceFrame) -> Stepped:
     return Stepped(index, source, await engine.step_apart(stream, lambda: source.frame))
-
-
-async def _read_ahead(source: StereoSource) -> AsyncGenerator[tuple[int, SourceFrame], None]:
-    """The frames, each decoded in a thread while the one before is in use."""
-    frames: Iterator[SourceFrame] = iter(source)
-    coming = asyncio.create_task(asyncio.to_thread(next, frames, None))
-    index = 0
-    try:
-        while (frame := await coming) is not None:
-            coming = asyncio.create_task(asyncio.to_thread(next, frames, None))
-            yield index, frame
-            index += 1
-    finally:
-        await asyncio.gather(coming, return_exceptions=True)
 
 
 def without_truth(source: StereoSource) -> StereoSource:

@@ -21,12 +21,12 @@ from vergence.cli.play import (
     write_sheet,
 )
 from vergence.cli.report import Report
-from vergence.cli.streaming import Answered, every_frame, live_frames, read_ahead
+from vergence.cli.streaming import Answered, every_frame, live_frames
 from vergence.cli.trouble import Trouble
 from vergence.client import DepthClient
 from vergence.session import DepthSession
 from vergence_proto.accuracy import Accuracy
-from vergence_proto.layouts import LayoutError, StereoSource, write_disparity_png
+from vergence_proto.layouts import LayoutError, StereoSource, read_ahead, write_disparity_png
 from vergence_proto.types import Delivery
 
 # Of a lone pair: there is no frame before it to build on.

@@ -3,12 +3,12 @@
 import asyncio
 import time
 from collections import deque
-from collections.abc import AsyncGenerator, AsyncIterator, Iterator
+from collections.abc import AsyncGenerator, AsyncIterator
 from dataclasses import dataclass
 
 from vergence.results import DepthResult
 from vergence.session import DepthSession
-from vergence_proto.layouts import SourceFrame, StereoSource
+from vergence_proto.layouts import SourceFrame
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -19,20 +19,6 @@ class Answered:
     source: SourceFrame
     result: DepthResult
     latency_s: float  # from handing the frame over to having its result
-
-
-async def read_ahead(source: StereoSource) -> AsyncGenerator[tuple[int, SourceFrame], None]:
-    """The frames of a source, each decoded in a thread while the one before is in use."""
-    frames: Iterator[SourceFrame] = iter(source)
-    coming = asyncio.create_task(asyncio.to_thread(next, frames, None))
-    index = 0
-    try:
-        while (frame := await coming) is not None:
-            coming = asyncio.create_task(asyncio.to_thread(next, frames, None))
-            yield index, frame
-            index += 1
-    finally:
-        await asyncio.gather(coming, return_exceptions=True)
 
 
 async def every_frame(

@@ -33,6 +33,7 @@ from vergence_proto.layouts import (
     tartanair,
     vergence_layout,
 )
+from vergence_proto.layouts.ahead import read_ahead
 from vergence_proto.layouts.files import LayoutError, numbers
 from vergence_proto.layouts.images import (
     encode_disparity_png,
@@ -55,6 +56,7 @@ __all__ = [
     "encode_pfm",
     "find_sources",
     "open_source",
+    "read_ahead",
     "read_disparity_png",
     "read_image",
     "read_pfm",
