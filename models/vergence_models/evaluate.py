@@ -66,7 +66,7 @@ def sgbm_method(scale: float) -> Method:
         limit = 192 if len(footage.views) == 1 and footage.rig.width > 700 else 128
         for view in footage.views:
             found = sgbm_disparity(view.left, view.right, max_disparity_px=limit, scale=scale)
-            yield Prediction(found, np.ones_like(found))
+            yield Prediction(found)
 
     return predict
 
@@ -120,9 +120,9 @@ class Tally:
                 continue
             self.frames.append(measures)
             self.by_index.setdefault(index, []).append(measures["epe"])
-            calibrated = calibration(prediction.disparity_px, prediction.sigma_px, view.truth_px)
-            if calibrated is not None:
-                self.calibrations.append(calibrated)
+            if prediction.sigma_px is not None:
+                told = calibration(prediction.disparity_px, prediction.sigma_px, view.truth_px)
+                self.calibrations += [told] if told else []
             before = footage.views[index - 1] if index else None
             if before is None or before.truth_px is None:
                 continue

@@ -89,7 +89,7 @@ def footage_from_clip(clips: StereoClips, index: int, name: str) -> Footage:
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
     disparity_px: Plane  # [H, W]
-    sigma_px: Plane  # [H, W]
+    sigma_px: Plane | None = None  # [H, W]; None: the method does not tell
 
 
 State = tuple[Plane, ...]  # each [1, C, h, w], in the order of the card
