@@ -11,6 +11,7 @@ import typer
 from vergence_proto.model_io import ManifestError
 from vergence_service.app import Running
 from vergence_service.app import serve as serve_until_stopped
+from vergence_service.memory import keep_freed_memory
 from vergence_service.model import ProviderUnavailable
 from vergence_service.settings import SettingsError, load_settings
 from vergence_service.transports import ExtraMissing, PortTaken, ZenohUnreachable
@@ -70,6 +71,7 @@ def serve(
             level=settings.log_level.upper(),
             format="%(asctime)s %(levelname)s %(name)s %(message)s",
         )
+        keep_freed_memory()
         asyncio.run(serve_until_stopped(settings, on_serving=_announce))
     except _OPERATOR_ERRORS as error:
         typer.echo(f"vergence serve: {error}", err=True)

@@ -1,0 +1,80 @@
+"""The law of the science side: what the server streams is what PyTorch computes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from tests.support.server import running_server
+from vergence import Delivery, DepthClient, OutputFormat, PlaneEncoding, RectifiedRig
+from vergence_models.evaluate import WEIGHTS
+from vergence_models.export import PARITY_PX, shifted_pair
+from vergence_models.network import StereoNetwork
+from vergence_models.runs import read_run
+from vergence_proto.geometry import Pose, uvd_curr_from_prev
+from vergence_service.model import OnnxStereoModel
+
+# The run that the shipped graphs were exported from.
+RUN = Path(__file__).parents[2] / "models" / "runs" / "lite"
+FRAMES = 4
+RIG = RectifiedRig(256, 192, 200.0, 200.0, 127.5, 127.5, 95.5, 0.1)
+STEP_M = 0.004
+
+Pair = tuple[NDArray[np.uint8], NDArray[np.uint8]]
+
+
+def footage() -> list[tuple[Pair, Pose]]:
+    """A camera that pans along a slanted wall, with poses that say so."""
+    return [
+        (
+            shifted_pair(RIG.height, RIG.width, 0, pan_px=2 * index),
+            Pose(np.eye(3), np.array([STEP_M * index, 0.0, 0.0])),
+        )
+        for index in range(FRAMES)
+    ]
+
+
+def by_pytorch(network: StereoNetwork) -> list[NDArray[np.float32]]:
+    state = network.cold_state(1, RIG.height, RIG.width)
+    world_from_prev, maps = Pose.identity(), []
+    for (left, right), world_from_curr in footage():
+        curr_from_prev = world_from_curr.inverse() @ world_from_prev
+        with torch.inference_mode():
+            estimate, state = network(
+                torch.from_numpy(left),
+                torch.from_numpy(right),
+                torch.from_numpy(uvd_curr_from_prev(RIG, curr_from_prev))[None],
+                state,
+                1,
+            )
+        maps.append(estimate.disparity[0].numpy())
+        world_from_prev = world_from_curr
+    return maps
+
+
+async def test_streamed_equals_pytorch_frame_by_frame() -> None:
+    run = read_run(RUN)
+    network = StereoNetwork(run.network).eval()
+    network.load_state_dict(run.weights)
+    model = OnnxStereoModel(WEIGHTS, "lite", providers=["cpu"], threads=2, allow_spinning=False)
+    exact = OutputFormat(encoding=PlaneEncoding.FLOAT32)
+    async with (
+        running_server(model) as server,
+        DepthClient(server.grpc_address) as client,
+        client.open_session(
+            RIG, delivery=Delivery.EVERY, output=exact, iterations=1, cold_iterations=1
+        ) as session,
+    ):
+        streamed = [await session.step(*pair_of(each), each[1]) for each in footage()]
+    assert [result.step_count for result in streamed] == [1, 2, 3, 4]
+    for result, expected in zip(streamed, by_pytorch(network), strict=True):
+        # The export's own tolerance, which says why it is of 99 pixels in 100.
+        assert np.nanquantile(np.abs(result.offset_px - expected), 0.99) < PARITY_PX
+
+
+def pair_of(each: tuple[Pair, Pose]) -> Pair:
+    (left, right), _ = each
+    return left[0], right[0]
