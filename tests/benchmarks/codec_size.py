@@ -85,7 +85,7 @@ def _shuffled_zstd(level: int, shape: tuple[int, int]) -> tuple[Encode, Decode]:
 
 
 def _blosc2(raw: Decode) -> tuple[Encode, Decode]:
-    import blosc2  # type: ignore[import-untyped]
+    import blosc2
 
     def encode(m: Map) -> Any:
         return blosc2.compress2(
@@ -102,7 +102,7 @@ def _blosc2(raw: Decode) -> tuple[Encode, Decode]:
 
 
 def _imagecodecs(raw: Decode, shape: tuple[int, int]) -> tuple[Encode, Decode]:
-    import imagecodecs  # type: ignore[import-not-found,unused-ignore]
+    import imagecodecs
 
     def encode(m: Map) -> Any:
         delta = imagecodecs.delta_encode(m, axis=1)
