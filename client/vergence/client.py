@@ -8,7 +8,7 @@ from typing import Self
 from vergence.info import ServerInfo, StreamInfo
 from vergence.results import SessionEvent
 from vergence.session import DepthSession
-from vergence.transports.addresses import connector
+from vergence.transports.addresses import connector, on_this_machine
 from vergence_proto import codec
 from vergence_proto.errors import BadShape
 from vergence_proto.geometry import Axes, RectifiedRig
@@ -32,6 +32,7 @@ class DepthClient:
 
     def __init__(self, server: str = DEFAULT_SERVER) -> None:
         self._connect = connector(server)
+        self._on_this_machine = on_this_machine(server)
 
     async def __aenter__(self) -> Self:
         self._transport = self._connect()
@@ -66,7 +67,8 @@ class DepthClient:
         delivery
             NEWEST: live, a newer frame displaces one that waits. EVERY: lossless, step() only.
         output
-            What results carry and how exactly; default: disparity to 1/64 px.
+            What results carry and how exactly; default: disparity to 1/64 px, compressed (which
+            loses nothing) unless the server is on this machine, where it would only cost time.
         iterations, cold_iterations
             Refinements of a warm step and of a cold start; 0: the server's defaults.
         encoding
@@ -89,7 +91,9 @@ class DepthClient:
             ),
             axes=codec.axes_to_proto(axes),
             delivery=codec.delivery_to_proto(delivery),
-            output=codec.output_format_to_proto(output or OutputFormat()),
+            output=codec.output_format_to_proto(
+                output or OutputFormat(compressed=not self._on_this_machine)
+            ),
             iterations=iterations,
             cold_iterations=cold_iterations,
         )

@@ -142,7 +142,8 @@ async def measure(args: argparse.Namespace) -> dict[str, float]:
         client.open_session(RIG, delivery=Delivery.EVERY, encoding=encoding) as session,
     ):
         first = await session.step(left, right, pose)
-        answer = codec.disparity_to_proto(first, OutputFormat()).ByteSize()
+        # As the session asks for it by default of a server on its own machine.
+        answer = codec.disparity_to_proto(first, OutputFormat(compressed=False)).ByteSize()
         async with (
             echoing(answer) as echo_address,
             grpc.aio.insecure_channel(

@@ -1,5 +1,6 @@
 """From the address of a server to what makes the transport to it."""
 
+import ipaddress
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -29,6 +30,21 @@ def connector(server: str) -> Callable[[], Transport]:
     if kind == "zenoh":
         return _zenoh_connector(server, link or "tcp")
     raise ValueError(_EXPECTED.format(server))
+
+
+def on_this_machine(server: str) -> bool:
+    """Whether bytes to and from ``server`` cost no network: it is named by a loopback address.
+
+    A Zenoh address is that of a router, and says nothing about where the server is.
+    """
+    scheme, _, address = server.rpartition("://")
+    host = urlsplit(f"//{address}").hostname or ""
+    if scheme not in ("", "grpc", "http", "https"):
+        return False
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 def _zenoh_connector(server: str, link: str) -> Callable[[], Transport]:
