@@ -145,7 +145,7 @@ class OnnxNetwork:
         previous: Pose | None = None
         for view in footage.views:
             height, width = view.left.shape[:2]
-            left, right = (grown(image, self.card)[None] for image in (view.left, view.right))
+            left, right = (self.card.grown(image)[None] for image in (view.left, view.right))
             matrix = np.eye(4, dtype=np.float32)
             if state is None or warm is None:
                 state, count = self.cold_state(*left.shape[1:3]), cold
@@ -157,11 +157,3 @@ class OnnxNetwork:
             disparity, sigma, state = self.run(left, right, matrix[None], state, count)
             previous = view.world_from_left
             yield Prediction(disparity[0, :height, :width], sigma[0, :height, :width])
-
-
-def grown(image: Image, card: ModelCard) -> Image:
-    """Grown at the right and the bottom, edges repeated: pixel coordinates stay as they are."""
-    height, width = image.shape[:2]
-    step_height, step_width = card.step_size(height, width)
-    around = ((0, step_height - height), (0, step_width - width), (0, 0))
-    return np.pad(image, around, mode="edge")

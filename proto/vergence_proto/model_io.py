@@ -26,6 +26,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
+from vergence_proto.types import Image
+
 LEFT = "left"
 RIGHT = "right"
 UVD_CURR_FROM_PREV = "uvd_curr_from_prev"
@@ -78,6 +82,15 @@ class ModelCard:
             -(-max(width, self.max_disparity_px) // self.stride),
         )
         return rows * self.stride, columns * self.stride
+
+    def grown(self, image: Image) -> Image:
+        """``image`` at its step size: edges repeated to the right and below, no pixel moves."""
+        height, width = image.shape[:2]
+        step_height, step_width = self.step_size(height, width)
+        if (step_height, step_width) == (height, width):
+            return image
+        around = ((0, step_height - height), (0, step_width - width), (0, 0))
+        return np.pad(image, around, mode="edge")
 
     def iterations_at_most(self, wanted: int) -> int:
         """The largest exported count that does not exceed ``wanted`` (at least the smallest)."""

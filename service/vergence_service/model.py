@@ -209,10 +209,10 @@ class OnnxStereoModel:
         ]
 
     def _feeds(self, steps: Sequence[Step]) -> dict[str, NDArray[np.generic]]:
-        left = _stack([_grown(step.view.left, self._card) for step in steps])
+        left = _stack([self._card.grown(step.view.left) for step in steps])
         feeds: dict[str, NDArray[np.generic]] = {
             LEFT: left,
-            RIGHT: _stack([_grown(step.view.right, self._card) for step in steps]),
+            RIGHT: _stack([self._card.grown(step.view.right) for step in steps]),
             UVD_CURR_FROM_PREV: _stack([step.uvd_curr_from_prev for step in steps]),
         }
         for index, tensor in enumerate(self._card.state):
@@ -269,13 +269,3 @@ def _available(provider: str) -> str:
 def _stack(rows: Sequence[NDArray[np.generic]]) -> NDArray[np.generic]:
     """A batch of rows; a single one is not copied."""
     return np.ascontiguousarray(rows[0])[None] if len(rows) == 1 else np.stack(rows)
-
-
-def _grown(image: Image, card: ModelCard) -> Image:
-    """Edges repeated to the right and below, where they move no pixel coordinate."""
-    height, width = image.shape[:2]
-    step_height, step_width = card.step_size(height, width)
-    if (step_height, step_width) == (height, width):
-        return image
-    around = ((0, step_height - height), (0, step_width - width), (0, 0))
-    return np.pad(image, around, mode="edge")
