@@ -1,7 +1,8 @@
-"""Exported graphs, stepped over footage: what evaluation, benchmarks and parity checks share."""
+"""Networks stepped over footage: what evaluation, studies, benchmarks and parity checks share."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -95,27 +96,12 @@ class Prediction:
 State = tuple[Plane, ...]  # each [1, C, h, w], in the order of the card
 
 
-class OnnxNetwork:
-    """The graphs of one model under onnxruntime on the CPU."""
+class SteppedNetwork(ABC):
+    """A network on a card, whatever computes it."""
 
-    def __init__(self, weights: Path, name: str, *, threads: int = 2) -> None:
-        """Raises ManifestError: no such model, or a file of it is damaged."""
-        self.card: ModelCard = load_model_card(weights, name)
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        options.inter_op_num_threads = 1
-        self._sessions = {
-            count: onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-            for count, path in self.card.graphs.items()
-        }
+    card: ModelCard
 
-    def cold_state(self, height: int, width: int, batch: int = 1) -> State:
-        """All zeros, for images of a size that ``card.step_size`` gives."""
-        return tuple(
-            np.zeros((batch, *tensor.shape(height, width)), np.float32)
-            for tensor in self.card.state
-        )
-
+    @abstractmethod
     def run(
         self,
         left: Image,
@@ -125,16 +111,13 @@ class OnnxNetwork:
         iterations: int,
     ) -> tuple[Plane, Plane, State]:
         """One step of a batch: disparity, sigma [B, H, W] and the next state."""
-        feed: dict[str, NDArray[np.generic]] = {
-            LEFT: left,
-            RIGHT: right,
-            UVD_CURR_FROM_PREV: uvd_curr_from_prev,
-        }
-        for tensor, value in zip(self.card.state, state, strict=True):
-            feed[tensor.input_name] = value
-        outputs = [DISPARITY, SIGMA, *(tensor.output_name for tensor in self.card.state)]
-        disparity, sigma, *following = self._sessions[iterations].run(outputs, feed)
-        return disparity, sigma, tuple(following)
+
+    def cold_state(self, height: int, width: int, batch: int = 1) -> State:
+        """All zeros, for images of a size that ``card.step_size`` gives."""
+        return tuple(
+            np.zeros((batch, *tensor.shape(height, width)), np.float32)
+            for tensor in self.card.state
+        )
 
     def sequence(self, footage: Footage, *, cold: int, warm: int | None) -> Iterator[Prediction]:
         """Step through footage: ``cold`` iterations on the first frame, then ``warm``.
@@ -157,3 +140,37 @@ class OnnxNetwork:
             disparity, sigma, state = self.run(left, right, matrix[None], state, count)
             previous = view.world_from_left
             yield Prediction(disparity[0, :height, :width], sigma[0, :height, :width])
+
+
+class OnnxNetwork(SteppedNetwork):
+    """The graphs of one model under onnxruntime on the CPU."""
+
+    def __init__(self, weights: Path, name: str, *, threads: int = 2) -> None:
+        """Raises ManifestError: no such model, or a file of it is damaged."""
+        self.card = load_model_card(weights, name)
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads
+        options.inter_op_num_threads = 1
+        self._sessions = {
+            count: onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+            for count, path in self.card.graphs.items()
+        }
+
+    def run(
+        self,
+        left: Image,
+        right: Image,
+        uvd_curr_from_prev: NDArray[np.float32],
+        state: State,
+        iterations: int,
+    ) -> tuple[Plane, Plane, State]:
+        feed: dict[str, NDArray[np.generic]] = {
+            LEFT: left,
+            RIGHT: right,
+            UVD_CURR_FROM_PREV: uvd_curr_from_prev,
+        }
+        for tensor, value in zip(self.card.state, state, strict=True):
+            feed[tensor.input_name] = value
+        outputs = [DISPARITY, SIGMA, *(tensor.output_name for tensor in self.card.state)]
+        disparity, sigma, *following = self._sessions[iterations].run(outputs, feed)
+        return disparity, sigma, tuple(following)
