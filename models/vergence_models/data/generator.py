@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,7 @@ class GeneratorConfig:
     height: int = 192
     frames: int = 4
     rate_hz: float = 30.0
+    largest_zoom: float = 1.0  # clips are windows of a camera up to so many times as wide and high
     textures: Path | None = None  # a folder of photographs; None: procedural textures only
     bank_seed: int = 0
     texture_size: int = 256
@@ -56,15 +57,14 @@ class ClipGenerator:
         return surface_truth(shots, width=c.width, height=c.height, device=self.device)
 
     def _shots(self, seed: int, indices: Sequence[int]) -> list[Shot]:
+        return [self._shot(np.random.default_rng((seed, index))) for index in indices]
+
+    def _shot(self, rng: np.random.Generator) -> Shot:
         c = self.config
-        return [
-            draw_shot(
-                np.random.default_rng((seed, index)),
-                self.bank.kinds,
-                width=c.width,
-                height=c.height,
-                frames=c.frames,
-                rate_hz=c.rate_hz,
-            )
-            for index in indices
-        ]
+        zoom = np.exp(rng.uniform(0, np.log(c.largest_zoom))) if c.largest_zoom > 1 else 1.0
+        width, height = round(c.width * zoom), round(c.height * zoom)
+        shot = draw_shot(
+            rng, self.bank.kinds, width=width, height=height, frames=c.frames, rate_hz=c.rate_hz
+        )
+        x, y = (int(rng.integers(spare + 1)) for spare in (width - c.width, height - c.height))
+        return replace(shot, cx=shot.cx - x, cy=shot.cy - y)

@@ -252,6 +252,9 @@ def main(
     frames: Annotated[int, typer.Option(min=1)] = 4,
     size: Annotated[str, typer.Option(metavar="WxH")] = "256x192",
     seed: Annotated[int, typer.Option()] = 0,
+    zoom: Annotated[
+        float, typer.Option(min=1, help="Up to so many times sharper: windows of a larger image.")
+    ] = 1.0,
     textures: Annotated[Path | None, typer.Option(help="Folder of photographs.")] = None,
     shard_clips: Annotated[int, typer.Option(min=1, help="Clips in a shard.")] = 50,
     workers: Annotated[int, typer.Option(min=1, help="Processes, one thread each.")] = 1,
@@ -260,7 +263,9 @@ def main(
     width, height = (int(side) for side in size.split("x"))
     if workers == 1:
         torch.set_num_threads(1)  # the arrays are too small to be shared among threads
-    config = GeneratorConfig(width=width, height=height, frames=frames, textures=textures)
+    config = GeneratorConfig(
+        width=width, height=height, frames=frames, largest_zoom=zoom, textures=textures
+    )
     count = render_pool(
         out, config, clips=clips, seed=seed, shard_clips=shard_clips, workers=workers
     )
