@@ -16,6 +16,12 @@ class NetworkConfig:
 
     max_disparity_px: int = 192
     stride: int = 32  # H and W are multiples of it
+
+
+@dataclass(frozen=True, slots=True)
+class LiteNetworkConfig(NetworkConfig):
+    """Of `lite`."""
+
     fine_bits: int = 16  # census comparisons per cell at 1/4 (48 would be 1 % better)
     coarse_bits: int = 48  # census comparisons per cell at 1/8, from the quarter-size image
     context_quarter: int = 32
@@ -52,12 +58,12 @@ class Config:
     """One tier."""
 
     name: str
-    network: NetworkConfig = field(default_factory=NetworkConfig)
+    network: NetworkConfig
     training: TrainingConfig = field(default_factory=TrainingConfig)
     iterations: tuple[int, ...] = (1, 2, 4, 8)  # graphs to export
 
 
-CONFIGS = {config.name: config for config in (Config("lite"),)}
+CONFIGS = {config.name: config for config in (Config("lite", LiteNetworkConfig()),)}
 
 
 def load_config(name: str) -> Config:
@@ -68,10 +74,11 @@ def load_config(name: str) -> Config:
         raise ConfigError(f"no configuration {name!r}; there are: {', '.join(CONFIGS)}") from None
 
 
-def network_from_dict(values: dict[str, int], source: str) -> NetworkConfig:
-    """The inverse of ``dataclasses.asdict``. Raises ConfigError naming ``source``."""
-    known = {entry.name for entry in dataclasses.fields(NetworkConfig)}
+def network_from_dict(tier: str, values: dict[str, int], source: str) -> NetworkConfig:
+    """The inverse of ``dataclasses.asdict`` for a tier's network. Raises ConfigError."""
+    kind = type(load_config(tier).network)
+    known = {entry.name for entry in dataclasses.fields(kind)}
     if set(values) != known:
         odd = ", ".join(sorted(set(values) ^ known))
-        raise ConfigError(f"{source}: expected the fields of NetworkConfig, these differ: {odd}")
-    return NetworkConfig(**values)
+        raise ConfigError(f"{source}: expected the fields of {kind.__name__}, these differ: {odd}")
+    return kind(**values)

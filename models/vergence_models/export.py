@@ -22,9 +22,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from vergence_models.config import Config, NetworkConfig, load_config
-from vergence_models.network import State, StereoNetwork
+from vergence_models.config import Config, load_config
 from vergence_models.runs import Run, read_run
+from vergence_models.tiers import AnyNetwork, build_network
 from vergence_proto.model_io import (
     DISPARITY,
     LEFT,
@@ -33,7 +33,6 @@ from vergence_proto.model_io import (
     RIGHT,
     SIGMA,
     UVD_CURR_FROM_PREV,
-    StateTensor,
 )
 
 log = logging.getLogger("vergence_models.export")
@@ -48,28 +47,22 @@ class ParityError(RuntimeError):
     """A graph does not compute what the PyTorch network computes."""
 
 
-def state_tensors(config: NetworkConfig) -> tuple[StateTensor, ...]:
-    """The recurrent state as the contract names it, in the order of :class:`State`."""
-    return (StateTensor("disparity", 1, 4), StateTensor("hidden_0", config.hidden, 8))
-
-
 class StepGraph(nn.Module):
     """The step with flat tensors in and out, in the order of the contract."""
 
-    def __init__(self, network: StereoNetwork, iterations: int) -> None:
+    def __init__(self, network: AnyNetwork, iterations: int) -> None:
         super().__init__()
         self.network = network
         self.iterations = iterations
 
     def forward(
-        self, left: Tensor, right: Tensor, matrix: Tensor, disparity: Tensor, hidden: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        state = State(disparity, hidden)
+        self, left: Tensor, right: Tensor, matrix: Tensor, *state: Tensor
+    ) -> tuple[Tensor, ...]:
         estimate, following = self.network(left, right, matrix, state, self.iterations)
-        return estimate.disparity, estimate.sigma, following.disparity, following.hidden
+        return estimate.disparity, estimate.sigma, *following
 
 
-def export_graph(network: StereoNetwork, iterations: int, path: Path) -> None:
+def export_graph(network: AnyNetwork, iterations: int, path: Path) -> None:
     """Write one graph with dynamic batch, height and width."""
     config = network.config
     stride = config.stride
@@ -77,7 +70,7 @@ def export_graph(network: StereoNetwork, iterations: int, path: Path) -> None:
     rows = torch.export.Dim("rows", min=1, max=128)
     columns = torch.export.Dim("columns", min=1, max=128)
     image = {0: batch, 1: stride * rows, 2: stride * columns}
-    tensors = state_tensors(config)
+    tensors = network.state_tensors
     states = tuple(
         {0: batch, 2: stride // t.scale * rows, 3: stride // t.scale * columns} for t in tensors
     )
@@ -95,7 +88,7 @@ def export_graph(network: StereoNetwork, iterations: int, path: Path) -> None:
             verbose=False,
             external_data=False,
             opset_version=OPSET,
-            dynamic_shapes=(image, image, {0: batch}, *states),
+            dynamic_shapes=(image, image, {0: batch}, states),
             input_names=[LEFT, RIGHT, UVD_CURR_FROM_PREV, *(t.input_name for t in tensors)],
             output_names=[DISPARITY, SIGMA, *(t.output_name for t in tensors)],
         )
@@ -128,7 +121,7 @@ def shifted_pair(
     return left[None].astype(np.uint8), right[None].astype(np.uint8)
 
 
-def check_parity(network: StereoNetwork, iterations: int, path: Path, *, frames: int = 3) -> float:
+def check_parity(network: AnyNetwork, iterations: int, path: Path, *, frames: int = 3) -> float:
     """How far 99 % of pixels are from PyTorch's over a short sequence, in px.
 
     Raises ParityError if that is more than :data:`PARITY_PX`.
@@ -168,7 +161,7 @@ def check_parity(network: StereoNetwork, iterations: int, path: Path, *, frames:
 
 def export_run(run: Run, config: Config, out: Path) -> None:
     """Write every graph of one tier and its entry of the manifest; other entries stay."""
-    network = StereoNetwork(run.network).eval()
+    network = build_network(run.network).eval()
     network.load_state_dict(run.weights)
     out.mkdir(parents=True, exist_ok=True)
     graphs = {}
@@ -182,7 +175,7 @@ def export_run(run: Run, config: Config, out: Path) -> None:
     entry = {
         "stride": run.network.stride,
         "max_disparity_px": run.network.max_disparity_px,
-        "state": [dataclasses.asdict(tensor) for tensor in state_tensors(run.network)],
+        "state": [dataclasses.asdict(tensor) for tensor in network.state_tensors],
         "graphs": graphs,
         "architecture": dataclasses.asdict(run.network),
         "parameters": sum(p.numel() for p in network.parameters()),

@@ -76,10 +76,10 @@ def require_same_network(contents: dict[str, Any], config: Config, path: Path) -
             f"{path}: expected a run of configuration {config.name!r}, got {contents['config']!r}"
         )
     try:
-        network = network_from_dict(contents["network"], str(path))
+        network = network_from_dict(config.name, contents["network"], str(path))
     except ConfigError as error:
         raise RunError(str(error)) from None
-    for entry in dataclasses.fields(NetworkConfig):
+    for entry in dataclasses.fields(config.network):
         expected, got = getattr(config.network, entry.name), getattr(network, entry.name)
         if expected != got:
             raise RunError(f"{path}: expected {entry.name} = {expected}, the run has {got}")
@@ -90,7 +90,9 @@ def read_run(folder: Path) -> Run:
     contents = load_checkpoint(folder)
     return Run(
         config_name=contents["config"],
-        network=network_from_dict(contents["network"], str(folder / CHECKPOINT_NAME)),
+        network=network_from_dict(
+            contents["config"], contents["network"], str(folder / CHECKPOINT_NAME)
+        ),
         weights=contents["average"],
         story=contents["story"],
         measured=contents["measured"],

@@ -31,9 +31,7 @@ from vergence_models.config import CONFIGS, Config, load_config
 from vergence_models.data.clips import StereoClips
 from vergence_models.data.pool import ClipPool
 from vergence_models.data.sensor import film_as_sensor
-from vergence_models.losses import step_loss
 from vergence_models.motion import perturbed, uvd_transforms
-from vergence_models.network import State, StereoNetwork
 from vergence_models.runs import (
     CHECKPOINT_NAME,
     Progress,
@@ -41,6 +39,7 @@ from vergence_models.runs import (
     require_same_network,
     save_checkpoint,
 )
+from vergence_models.tiers import AnyNetwork, build_network
 from vergence_models.validation import save_picture, validate
 
 log = logging.getLogger("vergence_models.train")
@@ -61,7 +60,7 @@ class Trainer:
         torch.manual_seed(config.training.seed)
         self.config = config
         self.device = device
-        self.network = StereoNetwork(config.network).to(device)
+        self.network = build_network(config.network).to(device)
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(),
@@ -132,7 +131,7 @@ class Trainer:
         matrices = self.transforms(clips).to(self.device)
         clips = clips.to(self.device)
         batch, frames, _, height, width = clips.left.shape
-        state = cold = State(*(t.to(self.device) for t in network.cold_state(batch, height, width)))
+        state = cold = network.cold_state(batch, height, width)
         loss = torch.zeros((), device=self.device)
         errors = []
         for frame in range(frames):
@@ -145,7 +144,7 @@ class Trainer:
             )
             estimate, state = network(left, right, matrices[:, frame], state, iterations)
             truth = clips.disparity_px[:, frame]
-            loss = loss + step_loss(estimate, truth, self.config.network.max_disparity_px) / frames
+            loss = loss + estimate.loss(truth, self.config.network.max_disparity_px) / frames
             errors.append((estimate.disparity.detach() - truth).abs()[truth > 0].mean().item())
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]  # torch annotates it so
@@ -165,9 +164,9 @@ class Trainer:
             "later": float(np.mean(errors[1:])) if frames > 1 else errors[0],
         }
 
-    def averaged_network(self) -> StereoNetwork:
+    def averaged_network(self) -> AnyNetwork:
         """The network with the averaged weights: the one to validate and export."""
-        network = StereoNetwork(self.config.network).to(self.device).eval()
+        network = build_network(self.config.network).to(self.device).eval()
         network.load_state_dict(self.average)
         return network
 

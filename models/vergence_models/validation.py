@@ -16,7 +16,8 @@ from vergence_models.data.pool import ClipPool
 from vergence_models.data.sensor import film_as_sensor
 from vergence_models.losses import known
 from vergence_models.motion import uvd_transforms
-from vergence_models.network import Estimate, State, StereoNetwork
+from vergence_models.network import Estimate
+from vergence_models.tiers import AnyNetwork
 
 COLD_ITERATIONS = 4
 
@@ -28,12 +29,12 @@ def filmed(pool: ClipPool, indices: range) -> StereoClips:
 
 @torch.inference_mode()
 def predict(
-    network: StereoNetwork, clips: StereoClips, device: torch.device, *, iterations: int = 1
+    network: AnyNetwork, clips: StereoClips, device: torch.device, *, iterations: int = 1
 ) -> list[Estimate]:
     """The estimate of every frame of the clips, cold on the first, then warm."""
     matrices = uvd_transforms(clips, clips.world_from_left).to(device)
     batch, frames, _, height, width = clips.left.shape
-    state = State(*(t.to(device) for t in network.cold_state(batch, height, width)))
+    state = network.cold_state(batch, height, width)
     estimates = []
     for frame in range(frames):
         left, right = (
@@ -47,7 +48,7 @@ def predict(
 
 
 def validate(
-    network: StereoNetwork, pool: ClipPool, device: torch.device, *, clips: int = 48
+    network: AnyNetwork, pool: ClipPool, device: torch.device, *, clips: int = 48
 ) -> dict[str, float]:
     """Mean errors over the first ``clips`` of a pool: cold (frame 1) and warm (the others).
 
@@ -78,7 +79,7 @@ def measures(errors: Tensor, sigma: Tensor) -> dict[str, float]:
 
 
 def save_picture(
-    network: StereoNetwork, pool: ClipPool, path: Path, device: torch.device, *, clips: int = 6
+    network: AnyNetwork, pool: ClipPool, path: Path, device: torch.device, *, clips: int = 6
 ) -> None:
     """A PNG with a row per clip: left image, truth, estimate, error, sigma of its last frame."""
     part = filmed(pool, range(min(clips, len(pool))))

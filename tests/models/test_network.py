@@ -10,20 +10,20 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from vergence_models.config import NetworkConfig
+from vergence_models.config import LiteNetworkConfig
 from vergence_models.evaluate import WEIGHTS
 from vergence_models.export import PARITY_PX, check_parity, export_graph, shifted_pair
 from vergence_models.layers import all_pairs, banded, best_rival, lookup, lookup_row
-from vergence_models.network import State, StereoNetwork
+from vergence_models.lite.network import LiteNetwork, LiteState
 from vergence_models.stepping import OnnxNetwork
 
 HEIGHT, WIDTH = 192, 256
 
 
 @pytest.fixture(scope="module")
-def network() -> StereoNetwork:
+def network() -> LiteNetwork:
     torch.manual_seed(3)
-    return StereoNetwork(NetworkConfig()).eval()
+    return LiteNetwork(LiteNetworkConfig()).eval()
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +36,7 @@ def views(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.from_numpy(left), torch.from_numpy(right)
 
 
-def test_an_untrained_network_already_matches(network: StereoNetwork) -> None:
+def test_an_untrained_network_already_matches(network: LiteNetwork) -> None:
     left, right = views(0)
     with torch.inference_mode():
         estimate, _ = network(
@@ -50,7 +50,7 @@ def test_an_untrained_network_already_matches(network: StereoNetwork) -> None:
 
 
 def test_the_graph_equals_pytorch_frame_by_frame(
-    network: StereoNetwork, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    network: LiteNetwork, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Under pytest's capture the tracer would format every symbolic shape it meets: minutes of it.
     monkeypatch.setattr(logging.getLogger("torch.__trace"), "propagate", False)
@@ -59,9 +59,9 @@ def test_the_graph_equals_pytorch_frame_by_frame(
     assert check_parity(network, 2, path, frames=4) < PARITY_PX
 
 
-def test_rows_of_a_pytorch_batch_are_independent(network: StereoNetwork) -> None:
+def test_rows_of_a_pytorch_batch_are_independent(network: LiteNetwork) -> None:
     a, b = views(1), views(2)
-    state = State(
+    state = LiteState(
         torch.rand(2, 1, HEIGHT // 4, WIDTH // 4) * 30,
         torch.randn(2, network.config.hidden, HEIGHT // 8, WIDTH // 8),
     )
@@ -69,7 +69,7 @@ def test_rows_of_a_pytorch_batch_are_independent(network: StereoNetwork) -> None
     matrix[1, 0, 3] = 3.0
     with torch.inference_mode():
         both, _ = network(torch.cat((a[0], b[0])), torch.cat((a[1], b[1])), matrix, state, 1)
-        alone, _ = network(*b, matrix[1:], State(state.disparity[1:], state.hidden[1:]), 1)
+        alone, _ = network(*b, matrix[1:], LiteState(state.disparity[1:], state.hidden[1:]), 1)
     # PyTorch picks its convolution by batch size, so not to the bit.
     assert (both.disparity[1] - alone.disparity[0]).abs().mean() < 1e-3
 

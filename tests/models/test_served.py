@@ -12,8 +12,8 @@ from tests.support.server import running_server
 from vergence import Delivery, DepthClient, OutputFormat, PlaneEncoding, RectifiedRig
 from vergence_models.evaluate import WEIGHTS
 from vergence_models.export import PARITY_PX, shifted_pair
-from vergence_models.network import StereoNetwork
 from vergence_models.runs import read_run
+from vergence_models.tiers import AnyNetwork, build_network
 from vergence_proto.geometry import Pose, uvd_curr_from_prev
 from vergence_service.model import OnnxStereoModel
 
@@ -37,7 +37,7 @@ def footage() -> list[tuple[Pair, Pose]]:
     ]
 
 
-def by_pytorch(network: StereoNetwork) -> list[NDArray[np.float32]]:
+def by_pytorch(network: AnyNetwork) -> list[NDArray[np.float32]]:
     state = network.cold_state(1, RIG.height, RIG.width)
     world_from_prev, maps = Pose.identity(), []
     for (left, right), world_from_curr in footage():
@@ -57,7 +57,7 @@ def by_pytorch(network: StereoNetwork) -> list[NDArray[np.float32]]:
 
 async def test_streamed_equals_pytorch_frame_by_frame() -> None:
     run = read_run(RUN)
-    network = StereoNetwork(run.network).eval()
+    network = build_network(run.network).eval()
     network.load_state_dict(run.weights)
     model = OnnxStereoModel(WEIGHTS, "lite", providers=["cpu"], threads=2, allow_spinning=False)
     exact = OutputFormat(encoding=PlaneEncoding.FLOAT32)

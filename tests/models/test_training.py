@@ -10,17 +10,18 @@ import torch
 
 from tests.models.clips import wall_clips
 from vergence_models import config as configs
-from vergence_models.config import Config, NetworkConfig, TrainingConfig, load_config
+from vergence_models.config import Config, LiteNetworkConfig, TrainingConfig, load_config
 from vergence_models.data.pool import ClipPool, write_shard
-from vergence_models.losses import laplace_nll, step_loss
+from vergence_models.losses import laplace_nll
 from vergence_models.motion import perturbed, uvd_transforms
 from vergence_models.runs import CHECKPOINT_NAME, RunError, load_checkpoint, read_run
 from vergence_models.train import Trainer, main
 from vergence_models.validation import predict, validate
 
+NETWORK = LiteNetworkConfig(context_eighth=16, context_low=16)
 SMALL = Config(
     "lite",
-    network=NetworkConfig(context_eighth=16, context_low=16),
+    network=NETWORK,
     training=TrainingConfig(frames=2, warmup_steps=1),
 )
 
@@ -80,7 +81,7 @@ def test_the_command_trains_saves_and_goes_on(
 
 def test_another_configuration_is_refused_by_file_and_expectation(tmp_path: Path) -> None:
     Trainer(SMALL, torch.device("cpu")).save(tmp_path)
-    other = dataclasses.replace(SMALL, network=dataclasses.replace(SMALL.network, hidden=16))
+    other = dataclasses.replace(SMALL, network=dataclasses.replace(NETWORK, hidden=16))
     with pytest.raises(RunError, match=rf"{CHECKPOINT_NAME}: expected hidden = 16, the run has 32"):
         Trainer(other, torch.device("cpu")).resume(tmp_path)
     renamed = dataclasses.replace(SMALL, name="full")
@@ -117,8 +118,8 @@ def test_unknown_truth_costs_nothing() -> None:
     half[:, :, 112:] = 0
     wrong = half.clone()
     wrong[:, :, 112:] = 500  # beyond the range: as good as unknown
-    assert step_loss(estimate, half, 192) == step_loss(estimate, wrong, 192)
-    assert step_loss(estimate, truth, 192) != step_loss(estimate, half, 192)
+    assert estimate.loss(half, 192) == estimate.loss(wrong, 192)
+    assert estimate.loss(truth, 192) != estimate.loss(half, 192)
 
 
 def test_the_best_sigma_is_the_mean_error() -> None:

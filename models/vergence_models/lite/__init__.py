@@ -1,0 +1,1 @@
+"""The `lite` tier: the recurrence on an encoder made for CPUs."""

@@ -1,0 +1,191 @@
+"""The coarse search at 1/8: every disparity, four pixels apart, and iterations on its scores."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from vergence_models.config import LiteNetworkConfig
+from vergence_models.layers import (
+    GatedCell,
+    best_rival,
+    box3,
+    conv,
+    enlarge,
+    lookup,
+    lookup_row,
+    shares,
+    silent,
+    squash,
+)
+from vergence_models.warp import cell_centres
+
+BIN_PX = 4  # spacing of the coarse disparities
+REACH = 2  # entries looked up on either side of the current disparity
+TAPS = 2 * REACH + 1
+CELL_INPUTS = TAPS + 8  # what the cell sees besides the context
+MIN_PX = 0.1  # no answer is nearer to infinity
+
+
+class CostFilter(nn.Module):
+    """Coarse scores from the raw volume.
+
+    Box windows of three sizes, a doubt about matches that another surface claims too, and a learned
+    residual.
+
+    The residual is the same small network for every disparity (folded into the batch), told what
+    the image looks like and where the previous frame's surface lies: what it learns at one
+    disparity holds at all of them.
+    """
+
+    def __init__(self, config: LiteNetworkConfig) -> None:
+        super().__init__()
+        width = config.cost_channels
+        self.sharpness = nn.Parameter(torch.tensor([6.0, 8.0, 10.0]))
+        self.mutual = nn.Parameter(torch.tensor(0.3))
+        self.enter = conv(9, width, stride=2)
+        self.context = conv(config.context_low, width, kernel=1)
+        self.down = conv(width, width, stride=2)
+        self.low = conv(width, width)
+        self.middle = conv(width, width)
+        self.leave = silent(conv(width, 4, kernel=1))
+
+    def forward(self, volume: Tensor, context: Tensor, prior: Tensor) -> Tensor:
+        """``volume`` [B, H, W, D] at 1/8, ``context`` at 1/16, ``prior`` [B, 1, H, W] px or 0."""
+        batch, height, width, bins = volume.shape
+        narrow = volume.permute(0, 3, 1, 2)
+        middle = box3(narrow)
+        wide = box3(box3(middle))
+        fixed = narrow * self.sharpness[0] + middle * self.sharpness[1] + wide * self.sharpness[2]
+        lead = (fixed - fixed.amax(dim=1, keepdim=True)) * 0.1
+        rival = best_rival(fixed.permute(0, 2, 3, 1), 2 * width).permute(0, 3, 1, 2)
+        claim = (fixed - rival).clamp(max=0) * 0.1
+        bin_px = torch.arange(bins - 1, -1, -1, device=volume.device).to(volume.dtype) * BIN_PX
+        bin_px = bin_px[None, :, None, None]
+        near = 1 - (prior - bin_px).abs() * (1 / (2 * BIN_PX))
+        near = near.clamp(min=0) * (prior > 0).to(volume.dtype)
+        u, _ = cell_centres(height, width, 8, volume)
+        in_view = (bin_px <= u).to(volume.dtype).expand_as(narrow)
+        sides = F.pad(middle, (0, 0, 0, 0, 1, 1))
+        channels = (
+            narrow,
+            middle,
+            wide,
+            lead.clamp(min=-1),
+            near,
+            sides[:, :-2],
+            sides[:, 2:],
+            claim.clamp(min=-1),
+            in_view,
+        )
+        stacked = torch.stack(channels, dim=2)
+        x = self.enter(stacked.reshape(batch * bins, len(channels), height, width))
+        x = x.view(batch, bins, -1, height // 2, width // 2) + self.context(context)[:, None]
+        x = F.relu(x.view(batch * bins, -1, height // 2, width // 2))
+        low = F.relu(self.low(F.relu(self.down(x))))
+        x = F.relu(self.middle(x + enlarge(low)))
+        residual = F.pixel_shuffle(self.leave(x), 2).view(batch, bins, height, width)
+        return (fixed + 10 * self.mutual * claim + residual).permute(0, 2, 3, 1)
+
+
+def coarse_position(d: Tensor, bins: int) -> Tensor:
+    """Where disparity ``d`` px lies on the last axis of the coarse scores."""
+    return (bins - 1) - d * (1 / BIN_PX)
+
+
+def peak(scores: Tensor) -> tuple[Tensor, Tensor]:
+    """Disparity px and log-probability of the best window of five bins, each [B, 1, H, W]."""
+    bins = scores.shape[-1]
+    best = scores.argmax(dim=-1, keepdim=True).clamp(2, bins - 3)
+    offsets = torch.arange(-2, 3, device=scores.device)
+    window = scores.gather(3, best + offsets)
+    top = window.amax(dim=-1, keepdim=True)
+    weights = torch.exp(window - top)
+    mass = weights.sum(dim=-1, keepdim=True)
+    total = torch.exp(scores - top).sum(dim=-1, keepdim=True)
+    centre = (weights * offsets.to(scores.dtype)).sum(dim=-1, keepdim=True) / mass
+    d = (bins - 1 - best.to(scores.dtype) - centre) * BIN_PX
+    return d.permute(0, 3, 1, 2), torch.log(mass / total).permute(0, 3, 1, 2)
+
+
+def smooth_fill(d: Tensor, confidence: Tensor) -> Tensor:
+    """What confident surroundings say: a pull-push pyramid of confidence-weighted means. [B,1,H,W].
+
+    Where a cell is confident it hears itself and its neighbours; on a blank wall, the wall's rim.
+    """
+    weight = confidence + 1e-4
+    both = torch.cat((d * weight, weight), dim=1)
+    half = F.avg_pool2d(both, 2)
+    quarter = F.avg_pool2d(half, 2)
+    wide = box3(quarter)
+    wide = wide + 0.1 * box3(box3(wide))
+    half = box3(half) + 0.1 * F.interpolate(wide, scale_factor=2.0, mode="bilinear")
+    total = box3(both) + 0.1 * F.interpolate(half, scale_factor=2.0, mode="bilinear")
+    return total[:, :1] / total[:, 1:]
+
+
+def far_fill(d: Tensor, confidence: Tensor, otherwise: Tensor) -> Tensor:
+    """The farthest surface among confident neighbours: what an occluded cell shows.
+
+    Mostly along the row; ``otherwise`` where no neighbour is confident. All [B, 1, H, W].
+    """
+    doubtful = d + 1e3 * (confidence < 0.5).to(d.dtype)
+    near = -F.max_pool2d(-doubtful, (3, 9), stride=1, padding=(1, 4))
+    wide = -F.max_pool2d(-near, (3, 9), stride=1, padding=(1, 4))
+    found = torch.where(near < 1e3, near, wide)
+    return torch.where(found < 1e3, found, otherwise)
+
+
+class CoarseUpdate(nn.Module):
+    """One iteration at 1/8: look at the scores round the current disparity, choose, correct."""
+
+    def __init__(self, config: LiteNetworkConfig) -> None:
+        super().__init__()
+        self.cell = GatedCell(config.hidden, 64 - config.hidden)
+        self.head = conv(config.hidden, config.hidden)
+        self.out = silent(conv(config.hidden, 5, kernel=1))
+
+    def forward(
+        self,
+        hidden: Tensor,
+        d: Tensor,
+        *,
+        guess: tuple[Tensor, Tensor],
+        fill: Tensor,
+        far: Tensor,
+        hole: Tensor,
+        scores: Tensor,
+        top: Tensor,
+        context: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """Hidden state and disparity [B, 1, H, W] px to the next ones."""
+        guess_px, guess_log = guess
+        bins = scores.shape[-1]
+        around = lookup_row(scores, coarse_position(d, bins).permute(0, 2, 3, 1), REACH)
+        fills = torch.cat((fill, far), dim=1)
+        at_fills = lookup(scores, coarse_position(fills, bins).permute(0, 2, 3, 1))
+        log_p = torch.cat((around, at_fills), dim=-1).permute(0, 3, 1, 2)
+        log_p = (log_p - top).clamp(-20, 0)
+        inputs = torch.cat(
+            (
+                context,
+                log_p * 0.1,
+                guess_log,
+                squash(guess_px - d, 2.0),
+                squash(fill - d, 2.0),
+                squash(far - d, 2.0),
+                hole,
+                d * (1 / 64),
+            ),
+            dim=1,
+        )
+        hidden = self.cell(hidden, inputs)
+        learned = self.out(F.relu(self.head(hidden)))
+        # Fixed part of the choice: the score itself, and a doubt about guesses that are not unique.
+        kept, at_fill, at_far = (log_p[:, k : k + 1] for k in (REACH, TAPS, TAPS + 1))
+        fixed = torch.cat((kept + 1, 2 * guess_log, at_fill - 1, at_far - 1), dim=1)
+        choice = shares(fixed + 4 * learned[:, :4], dim=1)
+        surfaces = torch.cat((d, guess_px, fills), dim=1)
+        chosen = (choice * surfaces).sum(dim=1, keepdim=True)
+        return hidden, (chosen + 4 * learned[:, 4:]).clamp(min=MIN_PX)

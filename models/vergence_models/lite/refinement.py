@@ -1,0 +1,89 @@
+"""The fine search, at 1/4: a handful of hypotheses per cell, and the way to full size."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from vergence_models.config import LiteNetworkConfig
+from vergence_models.layers import (
+    ConvexUpsampler,
+    added,
+    box3,
+    conv,
+    enlarge,
+    lookup,
+    lookup_row,
+    shares,
+    silent,
+    squash,
+)
+from vergence_models.lite.coarse import MIN_PX
+from vergence_models.warp import cell_centres
+
+FINE_PX = 2  # spacing of the fine descriptors along the right row
+REACH = 2  # entries looked up on either side of the current disparity
+TAPS = 2 * REACH + 1
+
+
+class Refinement(nn.Module):
+    """From 1/8 to full size: choose among nearby surfaces at 1/4, fit sub-pixel, upsample."""
+
+    def __init__(self, config: LiteNetworkConfig) -> None:
+        super().__init__()
+        width = config.fine_channels
+        self.hidden = conv(config.hidden, 16, kernel=1)
+        self.first = conv(config.context_quarter + 16 + 12, width, kernel=1)
+        self.choose = silent(conv(width, 4))
+        self.second = conv(width + 2 * TAPS + 6, width)
+        self.out = silent(conv(width, 3, kernel=1))
+        self.upsample = ConvexUpsampler(width)
+        self.sharpness = nn.Parameter(torch.tensor([6.0, 10.0]))
+        self.subpixel = nn.Parameter(torch.tensor(12.0))
+
+    def forward(
+        self, pairs: Tensor, d_eighth: Tensor, hidden: Tensor, prior: Tensor, context: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Full-size disparity and sigma [B, H, W], and the disparity at 1/4 [B, 1, H/4, W/4]."""
+        u, _ = cell_centres(prior.shape[2], prior.shape[3], 4, prior)
+        column = (u - 1.5) * (1 / FINE_PX)
+
+        def position(d: Tensor) -> Tensor:
+            return (column - d * (1 / FINE_PX)).permute(0, 2, 3, 1)
+
+        plain = F.interpolate(d_eighth, scale_factor=2.0, mode="bilinear")
+        rims = torch.cat((F.max_pool2d(d_eighth, 3, 1, 1), -F.max_pool2d(-d_eighth, 3, 1, 1)), 1)
+        hole = (prior <= 0).to(prior.dtype)
+        carried = prior + hole * plain
+        surfaces = torch.cat((plain, enlarge(rims), carried), dim=1)
+        cost = lookup(pairs, position(surfaces)).permute(0, 3, 1, 2)
+        wide = box3(cost)
+        apart = squash(surfaces[:, 1:] - plain, 2.0)
+        up = enlarge(self.hidden(hidden))
+        x = F.relu(self.first(torch.cat((context, up, cost, wide, apart, hole), dim=1)))
+        fixed = cost * self.sharpness[0] + wide * self.sharpness[1]
+        choice = shares(fixed + 4 * self.choose(x), dim=1)
+        d = (choice * surfaces).sum(dim=1, keepdim=True)
+
+        # Sub-pixel: the centre of the peak that the window's mean makes along the surface. A
+        # larger position is a smaller disparity.
+        looked_at = position(d)
+        taps = lookup_row(pairs, looked_at, REACH).permute(0, 3, 1, 2)
+        smooth = box3(taps)
+        fit = shares(self.subpixel * smooth, dim=1)
+        offset = added([fit[:, k : k + 1] * (FINE_PX * (REACH - k)) for k in range(TAPS)])
+        d = d + offset
+        step = carried - d
+        # Interpolated entries flatten a peak between two of them: tell where between them it lies.
+        phase = (looked_at - torch.floor(looked_at)).permute(0, 3, 1, 2).detach()
+        small = (squash(step, 0.5), squash(offset, 0.5), apart[:, :2], phase, hole)
+        x = F.relu(self.second(torch.cat((x, taps, smooth, *small), dim=1)))
+        out = self.out(x)
+        # The previous frame's surface is evidence too, while it agrees: half of a small step.
+        keep = torch.sigmoid(4 * out[:, 1:2]) * torch.exp(-step.abs()) * (1 - hole)
+        d = (d + keep * step + 2 * out[:, :1]).clamp(min=MIN_PX)
+        # Half a pixel at first; within e^-3.5 and e^4 times that.
+        sigma = 0.5 * torch.exp((4 * out[:, 2:]).clamp(-3.5, 4.0))
+        full = self.upsample(x, d).clamp(min=MIN_PX)
+        return full, F.interpolate(sigma, scale_factor=4.0, mode="bilinear")[:, 0], d
