@@ -2,8 +2,8 @@
 
     python -m vergence_models.evaluate --json out.json --data vergence:DIR --pool pool/val
 
-Every method sees the same frames in the same run. Prints Markdown, writes JSON, and with
-``--plots`` draws the cold-start curve.
+Every method sees the same frames in the same run. Prints Markdown (also written beside the JSON),
+and with ``--plots`` draws cold-start curves and the calibration of sigma.
 """
 
 from __future__ import annotations
@@ -11,205 +11,135 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-
 from vergence_models.data.pool import ClipPool
-from vergence_models.metrics import calibration, error_measures, temporal_error
-from vergence_models.motion import perturbed
-from vergence_models.sgbm import sgbm_disparity
+from vergence_models.methods import (
+    Method,
+    sgbm_methods,
+    single_frame_method,
+    warm_method,
+    with_pose_noise,
+    without_poses,
+)
+from vergence_models.metrics import SHARES_PCT
 from vergence_models.stepping import (
     Footage,
     OnnxNetwork,
-    Prediction,
+    SteppedNetwork,
     footage_from_clip,
     footage_from_source,
 )
+from vergence_models.tally import Tally, settled_frame
 from vergence_models.validation import filmed
-from vergence_proto.geometry import Pose
 from vergence_proto.layouts import LayoutError, find_sources, open_source
 from vergence_proto.model_io import ManifestError
 
 WEIGHTS = Path(__file__).parent / "weights"
-FRAME_PIXELS = 640 * 480  # times are told for a frame of this size
 
-Method = Callable[[Footage], Iterator[Prediction]]
-
-
-def without_poses(footage: Footage) -> Footage:
-    """The network is told that nothing moves."""
-    return replace(footage, views=[replace(v, world_from_left=None) for v in footage.views])
+Results = dict[str, dict[str, Tally]]  # group -> method -> its figures
 
 
-def with_noisy_poses(footage: Footage) -> Footage:
-    """The network is told poses that are off by up to 0.3 degrees and 1 mm."""
-    import torch
-
-    known = [view.world_from_left for view in footage.views]
-    if any(pose is None for pose in known):
-        return footage
-    poses = torch.from_numpy(np.stack([pose.matrix for pose in known if pose is not None]))[None]
-    noisy = perturbed(poses, max_deg=0.3, max_m=0.001, random=np.random.default_rng(0))[0]
-    views = [
-        replace(view, world_from_left=Pose.from_matrix(pose.numpy()))
-        for view, pose in zip(footage.views, noisy, strict=True)
-    ]
-    return replace(footage, views=views)
-
-
-def sgbm_method(scale: float) -> Method:
-    def predict(footage: Footage) -> Iterator[Prediction]:
-        limit = 192 if len(footage.views) == 1 and footage.rig.width > 700 else 128
-        for view in footage.views:
-            found = sgbm_disparity(view.left, view.right, max_disparity_px=limit, scale=scale)
-            yield Prediction(found)
-
-    return predict
-
-
-def methods_for(network: OnnxNetwork, *, thorough: bool) -> dict[str, Method]:
-    """Name -> how it predicts a sequence."""
+def methods_for(network: SteppedNetwork, *, thorough: bool) -> list[Method]:
+    """The network warm and cold, SGBM; ``thorough``: also told no motion, and noisy motion."""
     name, most = network.card.name, max(network.card.graphs)
-    table: dict[str, Method] = {
-        f"{name}, warm, 1 iteration": lambda f: network.sequence(f, cold=most, warm=1),
-        f"{name}, every frame cold, {most} iterations": lambda f: network.sequence(
-            f, cold=most, warm=None
-        ),
-    }
+    warm = warm_method(network, name, 1, cold=most)
+    methods = [warm, single_frame_method(network, name, most)]
     if thorough:
-        table[f"{name}, warm, no poses"] = lambda f: network.sequence(
-            without_poses(f), cold=most, warm=1
-        )
-        table[f"{name}, warm, poses off by 0.3 deg and 1 mm"] = lambda f: network.sequence(
-            with_noisy_poses(f), cold=most, warm=1
-        )
-    table["SGBM, full size"] = sgbm_method(1.0)
-    table["SGBM, half size"] = sgbm_method(0.5)
-    return table
+        methods += [
+            warm.told("no poses", without_poses),
+            warm.told(
+                "poses off by 0.3 deg and 1 mm",
+                lambda footage: with_pose_noise(footage, deg=0.3, m=0.001),
+            ),
+        ]
+    return methods + sgbm_methods()
 
 
-@dataclass(slots=True)
-class Tally:
-    """The figures of one method on one kind of footage."""
-
-    frames: list[dict[str, float]] = field(default_factory=list)
-    calibrations: list[dict[str, float]] = field(default_factory=list)
-    flicker: list[float] = field(default_factory=list)
-    by_index: dict[int, list[float]] = field(default_factory=dict)  # frame -> EPEs
-    cpu_s: float = 0.0
-    wall_s: float = 0.0
-    size: float = 0.0  # frames of FRAME_PIXELS
-
-    def add(self, footage: Footage, predictions: Iterator[Prediction]) -> None:
-        kept: list[Prediction] = []
-        for index, view in enumerate(footage.views):
-            cpu, wall = time.process_time(), time.perf_counter()
-            prediction = next(predictions)
-            self.cpu_s += time.process_time() - cpu
-            self.wall_s += time.perf_counter() - wall
-            self.size += footage.rig.width * footage.rig.height / FRAME_PIXELS
-            kept = [*kept[-1:], prediction]
-            if view.truth_px is None:
-                continue
-            measures = error_measures(prediction.disparity_px, view.truth_px)
-            if measures is None:
-                continue
-            self.frames.append(measures)
-            self.by_index.setdefault(index, []).append(measures["epe"])
-            if prediction.sigma_px is not None:
-                told = calibration(prediction.disparity_px, prediction.sigma_px, view.truth_px)
-                self.calibrations += [told] if told else []
-            before = footage.views[index - 1] if index else None
-            if before is None or before.truth_px is None:
-                continue
-            if before.world_from_left is None or view.world_from_left is None:
-                continue
-            flicker = temporal_error(
-                footage.rig,
-                view.world_from_left.inverse() @ before.world_from_left,
-                (kept[0].disparity_px, kept[1].disparity_px),
-                (before.truth_px, view.truth_px),
-            )
-            if flicker is not None:
-                self.flicker.append(flicker)
-
-    def summary(self) -> dict[str, float]:
-        """Means over frames; TEPE where poses and dense truth allow it; times per frame."""
-        found = means(self.frames)
-        if self.flicker:
-            found["tepe"] = float(np.mean(self.flicker))
-        found.update(means(self.calibrations))
-        found["cpu_ms"] = 1e3 * self.cpu_s / max(self.size, 1e-9)
-        found["wall_ms"] = 1e3 * self.wall_s / max(self.size, 1e-9)
-        return {name: round(value, 4) for name, value in found.items()}
+def footage_on_disk(data: list[str]) -> Iterator[Footage]:
+    """Every source under each KIND:PATH. Raises LayoutError."""
+    for spec in data:
+        for source in find_sources(spec):
+            yield footage_from_source(open_source(source))
 
 
-def means(rows: list[dict[str, float]]) -> dict[str, float]:
-    return {name: float(np.mean([row[name] for row in rows])) for name in (rows[0] if rows else {})}
+def footage_of_pool(folder: Path, clips: int) -> Iterator[Footage]:
+    """The first clips of a pool, as a camera films them. Raises FileNotFoundError."""
+    pool = ClipPool(folder)
+    for index in range(min(clips, len(pool))):
+        clip = filmed(pool, range(index, index + 1))
+        yield footage_from_clip(clip, 0, f"{folder.name}/{index}")
 
 
 def gather(data: list[str], pool: list[Path], clips: int) -> Iterator[tuple[str, Footage]]:
     """(group, footage): each source on disk is a group of its own, the clips of a pool are one."""
-    for spec in data:
-        for source in find_sources(spec):
-            footage = footage_from_source(open_source(source))
-            yield footage.name, footage
+    for footage in footage_on_disk(data):
+        yield footage.name, footage
     for folder in pool:
-        held_out = ClipPool(folder)
-        for index in range(min(clips, len(held_out))):
-            batch = filmed(held_out, range(index, index + 1))
-            yield f"pool {folder.name}", footage_from_clip(batch, 0, f"{folder.name}/{index}")
+        for footage in footage_of_pool(folder, clips):
+            yield f"pool {folder.name}", footage
 
 
-def evaluate(
-    network: OnnxNetwork, data: list[str], pool: list[Path], *, clips: int, thorough: bool
-) -> dict[str, dict[str, Tally]]:
+def evaluate(methods: list[Method], footages: Iterator[tuple[str, Footage]]) -> Results:
     """Group -> method -> its figures."""
-    methods = methods_for(network, thorough=thorough)
-    results: dict[str, dict[str, Tally]] = {}
-    for group, footage in gather(data, pool, clips):
-        tallies = results.setdefault(group, {name: Tally() for name in methods})
-        for name, method in methods.items():
-            tallies[name].add(footage, method(footage))
+    results: Results = {}
+    for group, footage in footages:
+        tallies = results.setdefault(group, {method.label: Tally() for method in methods})
+        for method in methods:
+            tallies[method.label].add(footage, method.predict(footage))
     return results
 
 
-COLUMNS = ("epe", "d1", "bad2", "d3", "d5", "p95", "p97", "p99", "tepe", "within_50", "cpu_ms")
+COLUMNS = {
+    "epe": "EPE",
+    "d1": "D1 %",
+    "bad2": "bad 2 %",
+    "d3": "D3 %",
+    "d5": "D5 %",
+    "p99": "bad 1 %, px",
+    "p97": "bad 3 %, px",
+    "p95": "bad 5 %, px",
+    "tepe": "TEPE",
+    "settled": "settled by frame",
+    "within_50": "in 50 % of sigma",
+    "within_90": "in 90 %",
+    "cpu_ms": "CPU ms",
+}
 
 
-def markdown(results: dict[str, dict[str, Tally]]) -> str:
+def figures(tally: Tally) -> dict[str, float]:
+    """The summary, and from which frame on a start has settled."""
+    settled = settled_frame(tally.epe_by_frame())
+    return tally.summary() | ({} if settled is None else {"settled": settled})
+
+
+def markdown(results: Results) -> str:
     """One table per group."""
     parts = []
     for group, tallies in results.items():
-        lines = [f"### {group}", "", "| method | " + " | ".join(COLUMNS) + " |"]
+        lines = [f"### {group}", "", "| method | " + " | ".join(COLUMNS.values()) + " |"]
         lines.append("|---|" + "---:|" * len(COLUMNS))
         for name, tally in tallies.items():
-            summary = tally.summary()
-            cells = [f"{summary[key]:.3g}" if key in summary else "" for key in COLUMNS]
+            found = figures(tally)
+            cells = [f"{found[key]:.3g}" if key in found else "" for key in COLUMNS]
             lines.append(f"| {name} | " + " | ".join(cells) + " |")
         parts.append("\n".join(lines))
-    return "\n\n".join(parts)
+    return "\n\n".join(parts) + "\n"
 
 
-def as_json(results: dict[str, dict[str, Tally]]) -> dict[str, object]:
+def as_json(results: Results) -> dict[str, object]:
     return {
         group: {
-            name: {
-                **tally.summary(),
-                "epe_by_frame": [round(float(np.mean(e)), 4) for e in tally.by_index.values()],
-            }
+            name: {**figures(tally), "epe_by_frame": tally.epe_by_frame()}
             for name, tally in tallies.items()
         }
         for group, tallies in results.items()
     }
 
 
-def draw_plots(results: dict[str, dict[str, Tally]], folder: Path) -> None:
-    """EPE against the frame's number, one PNG per group of sequences."""
+def draw_plots(results: Results, folder: Path) -> None:
+    """One PNG per group: EPE against the frame's number, and how far sigma keeps its word."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -217,20 +147,21 @@ def draw_plots(results: dict[str, dict[str, Tally]], folder: Path) -> None:
 
     folder.mkdir(parents=True, exist_ok=True)
     for group, tallies in results.items():
-        if max((len(tally.by_index) for tally in tallies.values()), default=0) < 2:
-            continue
-        figure, axes = plt.subplots(figsize=(8, 4))
+        figure, (start, trust) = plt.subplots(1, 2, figsize=(11, 4), width_ratios=(3, 2))
         for name, tally in tallies.items():
-            axes.plot([index + 1 for index in tally.by_index], means_by_index(tally), label=name)
-        axes.set(xlabel="frame", ylabel="EPE [px]", title=group, ylim=(0, None))
-        axes.legend(fontsize="small")
+            epes = tally.epe_by_frame()
+            start.plot(range(1, len(epes) + 1), epes, label=name, marker="." * (len(epes) < 2))
+            summary = tally.summary()
+            told = [summary[f"within_{s}"] for s in SHARES_PCT if f"within_{s}" in summary]
+            if told:
+                trust.plot(SHARES_PCT, told, marker=".", label=name)
+        start.set(xlabel="frame", ylabel="EPE [px]", title=group, ylim=(0, None))
+        start.legend(fontsize="small")
+        trust.plot((0, 100), (0, 100), color="0.7", linestyle=":")
+        trust.set(xlabel="interval of sigma [%]", ylabel="errors inside [%]", title="calibration")
         figure.tight_layout()
         figure.savefig(folder / f"{group.replace(' ', '_')}.png", dpi=110)
         plt.close(figure)
-
-
-def means_by_index(tally: Tally) -> list[float]:
-    return [float(np.mean(errors)) for errors in tally.by_index.values()]
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -242,7 +173,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--clips", type=int, default=32, help="of each pool")
     parser.add_argument("--thorough", action="store_true", help="also without and with noisy poses")
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--json", type=Path, help="written with a .md of the same name beside it")
     parser.add_argument("--plots", type=Path, help="folder for PNGs")
     given = parser.parse_args(arguments)
     if not (given.data or given.pool):
@@ -250,13 +181,15 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         network = OnnxNetwork(given.weights, given.model, threads=given.threads)
         results = evaluate(
-            network, given.data, given.pool, clips=given.clips, thorough=given.thorough
+            methods_for(network, thorough=given.thorough),
+            gather(given.data, given.pool, given.clips),
         )
     except (ManifestError, LayoutError, FileNotFoundError) as error:
         sys.exit(f"vergence_models.evaluate: {error}")
-    sys.stdout.write(markdown(results) + "\n")
+    sys.stdout.write(markdown(results))
     if given.json:
         given.json.write_text(json.dumps(as_json(results), indent=1) + "\n", "utf-8")
+        given.json.with_suffix(".md").write_text(markdown(results), "utf-8")
     if given.plots:
         draw_plots(results, given.plots)
 

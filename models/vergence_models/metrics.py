@@ -1,15 +1,22 @@
-"""Errors of disparity: per pixel, along the motion, and of its own uncertainty."""
+"""The figures of one frame: its errors, their change along the motion, and its own uncertainty.
+
+The definitions are :mod:`vergence_proto.accuracy`'s, under the short names that tables use.
+"""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vergence_proto.accuracy import accuracy, error_tail, temporal_epe
 from vergence_proto.geometry import Pose, RectifiedRig
 
 Plane = NDArray[np.float32]
 
 MIN_PIXELS = 20  # fewer known pixels say nothing about a frame
+SHARES_PCT = range(10, 100, 10)  # the intervals that sigma is judged by
 
 
 def error_measures(predicted_px: Plane, truth_px: Plane) -> dict[str, float] | None:
@@ -18,34 +25,39 @@ def error_measures(predicted_px: Plane, truth_px: Plane) -> dict[str, float] | N
     ``truth_px`` is NaN where unknown; None if hardly anything is known. The percentiles are what
     Stereo Matching in Time (WACV 2024) tabulates as bad 5, 3 and 1 %.
     """
-    known = np.isfinite(truth_px)
-    if known.sum() < MIN_PIXELS:
+    found = accuracy(predicted_px, truth_px)
+    if found.n < MIN_PIXELS:
         return None
-    error = np.abs(predicted_px[known] - truth_px[known])
-    shares = {"d1": 1, "bad2": 2, "d3": 3, "d5": 5}
+    tail = error_tail(predicted_px, truth_px)
     return {
-        "epe": float(error.mean()),
-        **{name: 100 * float((error > limit).mean()) for name, limit in shares.items()},
-        **{f"p{rank}": float(np.percentile(error, rank)) for rank in (95, 97, 99)},
+        "epe": found.epe_px,
+        "d1": found.d1_pct,
+        "bad2": found.bad2_pct,
+        "d3": found.d3_pct,
+        "d5": found.d5_pct,
+        "p95": tail.worst_5_pct_px,
+        "p97": tail.worst_3_pct_px,
+        "p99": tail.worst_1_pct_px,
     }
 
 
 def calibration(predicted_px: Plane, sigma_px: Plane, truth_px: Plane) -> dict[str, float] | None:
     """How far sigma says what the error is.
 
-    The shares of errors, in percent, within the 50 % and 90 % intervals of a Laplace distribution
-    of scale sigma, and the ratio of the means.
+    The shares of errors, in percent, within the 10 % to 90 % intervals of a Laplace distribution of
+    scale sigma, and the ratio of the means.
     """
     known = np.isfinite(truth_px)
     if known.sum() < MIN_PIXELS:
         return None
     error = np.abs(predicted_px[known] - truth_px[known])
     sigma = sigma_px[known]
-    return {
-        "within_50": 100 * float((error < sigma * np.log(2)).mean()),
-        "within_90": 100 * float((error < sigma * np.log(10)).mean()),
-        "sigma_over_error": float(sigma.mean() / max(error.mean(), 1e-6)),
+    relative = error / np.maximum(sigma, 1e-6)
+    within = {
+        f"within_{share}": 100 * float((relative < -math.log(1 - share / 100)).mean())
+        for share in SHARES_PCT
     }
+    return {**within, "sigma_over_error": float(sigma.mean() / max(error.mean(), 1e-6))}
 
 
 def temporal_error(
@@ -56,27 +68,13 @@ def temporal_error(
 ) -> float | None:
     """Flicker: the mean error in px of the change of disparity from the previous frame to this.
 
-    True surface points of the previous frame are carried to the current one by the true motion;
-    those seen there again (their true disparity agrees within half a pixel) are compared. None if
-    there are hardly any. Both pairs are (previous, current).
+    Both pairs are (previous, current). None if hardly any surface point is seen in both.
     """
-    before, now = truth_px
-    height, width = before.shape
-    v, u = np.nonzero(np.isfinite(before) & (before > 0.5))
-    d = before[v, u].astype(np.float64)
-    uvd = np.stack((u, v, d + 0.0, np.ones_like(d)))
-    q = rig.xyzw_from_uvd
-    x, y, z, w = np.linalg.inv(q) @ curr_from_prev.matrix @ q @ uvd
-    ahead = w > 1e-9
-    w = np.where(ahead, w, 1.0)
-    column, row, expected = np.rint(x / w), np.rint(y / w), z / w
-    inside = ahead & (expected > 0) & (column >= 0) & (row >= 0)
-    inside &= (column < width) & (row < height)
-    column, row = column[inside].astype(int), row[inside].astype(int)
-    u, v, expected = u[inside], v[inside], expected[inside]
-    seen = np.abs(now[row, column] - expected) < 0.5
-    if seen.sum() < MIN_PIXELS:
-        return None
-    row, column, u, v = row[seen], column[seen], u[seen], v[seen]
-    change = predicted_px[1][row, column] - predicted_px[0][v, u]
-    return float(np.abs(change - (now[row, column] - before[v, u])).mean())
+    found = temporal_epe(
+        *predicted_px,
+        prev_truth_px=truth_px[0],
+        curr_truth_px=truth_px[1],
+        rig=rig,
+        curr_from_prev=curr_from_prev,
+    )
+    return None if math.isnan(found.tepe_px) else found.tepe_px

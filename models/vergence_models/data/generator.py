@@ -11,7 +11,7 @@ import torch
 
 from vergence_models.data.clips import StereoClips
 from vergence_models.data.render import render
-from vergence_models.data.shots import draw_shot
+from vergence_models.data.shots import Playback, draw_shot
 from vergence_models.data.textures import TextureBank
 from vergence_models.data.truth import SurfaceTruth, surface_truth
 from vergence_models.data.views import Shot
@@ -26,6 +26,7 @@ class GeneratorConfig:
     frames: int = 4
     rate_hz: float = 30.0
     largest_zoom: float = 1.0  # clips are windows of a camera up to so many times as wide and high
+    playback: Playback | None = None  # the camera's speed; None: drawn anew for each clip
     textures: Path | None = None  # a folder of photographs; None: procedural textures only
     bank_seed: int = 0
     texture_size: int = 256
@@ -64,7 +65,13 @@ class ClipGenerator:
         zoom = np.exp(rng.uniform(0, np.log(c.largest_zoom))) if c.largest_zoom > 1 else 1.0
         width, height = round(c.width * zoom), round(c.height * zoom)
         shot = draw_shot(
-            rng, self.bank.kinds, width=width, height=height, frames=c.frames, rate_hz=c.rate_hz
+            rng,
+            self.bank.kinds,
+            width=width,
+            height=height,
+            frames=c.frames,
+            rate_hz=c.rate_hz,
+            playback=c.playback,
         )
         x, y = (int(rng.integers(spare + 1)) for spare in (width - c.width, height - c.height))
         return replace(shot, cx=shot.cx - x, cy=shot.cy - y)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vergence_models.data.materials import Palette
 from vergence_models.data.outdoors import street, swarm
@@ -24,23 +25,41 @@ class Mix:
     clutter: float = 0.2
 
 
+@dataclass(frozen=True, slots=True)
+class Playback:
+    """A calm head's motion, played back faster: one scene and one path, whatever the speed."""
+
+    speed: float = 1.0
+    # The scene leaves room for the path of a clip at this speed: the same room at every lower one.
+    fastest: float = 20.0
+
+
 def draw_shot(
     rng: np.random.Generator, kinds: tuple[str, ...], *, width: int, height: int, frames: int,
-    rate_hz: float, mix: Mix | None = None,
+    rate_hz: float, mix: Mix | None = None, playback: Playback | None = None,
 ) -> Shot:  # fmt: skip
-    """Draw everything about one clip. `kinds` names the textures of the bank that renders it."""
+    """Draw everything about one clip. `kinds` names the textures of the bank that renders it.
+
+    The camera's speed is drawn too, unless `playback` sets it; moving things keep their own.
+    """
     mix = mix or Mix()
     palette = Palette(rng, kinds)
     half_angle = np.radians(rng.uniform(50, 110)) / 2
     focal_px = width / 2 / np.tan(half_angle)
     low, high = (0.04, 0.2) if rng.random() < 0.8 else (0.2, 0.5)
     baseline_m = _log_uniform(rng, low, high)
-    speed = 0.0 if rng.random() < 0.06 else _log_uniform(rng, 0.3, 20)
-    motion = HeadMotion.draw(rng, speed=speed)
     times_s = np.arange(frames) / rate_hz
-    start_from_left = np.stack([motion.start_from_camera(t) for t in times_s])
-    travel_m = float(np.linalg.norm(start_from_left[:, :3, 3], axis=1).max())
-    turn = np.arccos(np.clip(start_from_left[:, 2, 2], -1, 1)).max()
+    if playback is None:
+        speed = 0.0 if rng.random() < 0.06 else _log_uniform(rng, 0.3, 20)
+        motion = HeadMotion.draw(rng, speed=speed)
+        start_from_left = reach = _poses(motion, times_s)
+    else:
+        motion = HeadMotion.draw(rng, speed=1.0)
+        start_from_left = _poses(motion, times_s * playback.speed)
+        path_s = times_s[-1] * playback.fastest
+        reach = _poses(motion, np.linspace(0, path_s, 1 + round(path_s * rate_hz)))
+    travel_m = float(np.linalg.norm(reach[:, :3, 3], axis=1).max())
+    turn = np.arccos(np.clip(reach[:, 2, 2], -1, 1)).max()
 
     largest_px = width * _log_uniform(rng, 0.06, 0.26)
     world_from_start = np.eye(4)
@@ -71,6 +90,11 @@ def draw_shot(
         cy=(height - 1) / 2 + float(rng.normal(0, 0.01)) * height,
         baseline_m=float(baseline_m),
     )
+
+
+def _poses(motion: HeadMotion, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """start_from_left [T, 4, 4]."""
+    return np.stack([motion.start_from_camera(t) for t in times_s])
 
 
 def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
