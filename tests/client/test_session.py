@@ -346,6 +346,31 @@ async def test_an_idle_stream_expires_after_a_notice() -> None:
     assert 0 < events[0].in_s <= 10
 
 
+async def test_an_end_that_meets_what_the_client_sends_is_told_as_what_it_is() -> None:
+    async def send_without_pause(session: DepthSession) -> None:
+        while True:
+            session.reset()
+            await asyncio.sleep(0)
+
+    clock = ManualClock()
+    events: list[SessionEvent] = []
+    async with (
+        running_server(RecallModel(), clock=clock) as server,
+        DepthClient(server.grpc_address) as client,
+    ):
+        for _ in range(10):  # the two meet in about every second
+            async with client.open_session(RIG, on_event=events.append) as session:
+                sending = asyncio.create_task(send_without_pause(session))
+                await step(session, 1)
+                clock.advance(60)
+                server.engine.streams.sweep()
+                with pytest.raises(StreamExpired):
+                    await anext(session)
+                with pytest.raises(StreamExpired):
+                    await sending
+    assert not events, "the client took the end for a broken connection, and tried again"
+
+
 async def test_pings_measure_the_round_trip(client: DepthClient) -> None:
     async with client.open_session(RIG) as session:
         await step(session, 1)

@@ -16,6 +16,9 @@ from vergence_proto.v1 import depth_pb2 as pb
 
 _SERVICE = "/vergence.v1.DepthService/"
 _ASK_TIMEOUT_S = 10.0
+# What gRPC says of a call whose end met a write, see _GrpcCall._keep_status.
+_WRITE_FAILED = "Internal error from Core"
+_STATUS_TIMEOUT_S = 1.0
 
 _CHANNEL_OPTIONS = (
     # Images exceed gRPC's default of 4 MiB; what is too large is for the server to say.
@@ -73,7 +76,11 @@ class _GrpcCall:
         address: str,
     ) -> None:
         self._call = call
+        self._responses = aiter(call)
         self._address = address
+        self._status: asyncio.Future[grpc.aio.AioRpcError]
+        self._status = asyncio.get_running_loop().create_future()
+        call.add_done_callback(self._keep_status)
 
     async def send(self, request: pb.StreamDepthRequest) -> None:
         # Both mean that the call has ended: before this write, or during it.
@@ -82,19 +89,55 @@ class _GrpcCall:
 
     async def receive(self) -> pb.StreamDepthResponse | None:
         try:
-            response = await self._call.read()
+            # Not read(): once a write has failed it leaves unread what has arrived, and the
+            # status comes behind that.
+            return await anext(self._responses, None)
         except grpc.aio.AioRpcError as error:
-            raise _error_from_rpc(error, self._address) from None
+            raise _error_from_rpc(await self._why_ended(error), self._address) from None
         except asyncio.CancelledError:
             # gRPC raises it also where nobody cancelled this task but the channel was closed.
             task = asyncio.current_task()
             if task is not None and task.cancelling():
                 raise
             raise ConnectionLost(f"the connection to {self._address} was closed") from None
-        return response if isinstance(response, pb.StreamDepthResponse) else None
 
     async def close(self) -> None:
         self._call.cancel()
+
+    async def _why_ended(self, error: grpc.aio.AioRpcError) -> grpc.aio.AioRpcError:
+        try:
+            return await asyncio.wait_for(self._status, _STATUS_TIMEOUT_S)
+        except TimeoutError:
+            return error
+
+    def _keep_status(self, call: object) -> None:
+        """Keep the server's status as it comes.
+
+        A write that is under way when the call ends fails, and gRPC puts an INTERNAL of its own in
+        the place of what the server said, or says a moment later (grpc/grpc#36066).
+        """
+        status = _status_of(self._call)
+        if status.details() != _WRITE_FAILED and not self._status.done():
+            self._status.set_result(status)
+
+
+def _status_of(
+    call: "grpc.aio.StreamStreamCall[pb.StreamDepthRequest, pb.StreamDepthResponse]",
+) -> grpc.aio.AioRpcError:
+    """Of a call that has ended: there is nothing to wait for, so this need not be awaited."""
+
+    async def read() -> grpc.aio.AioRpcError:
+        metadata = await call.trailing_metadata()
+        code, details = await call.code(), await call.details()
+        return grpc.aio.AioRpcError(code, grpc.aio.Metadata(), metadata, details, None)
+
+    reading = read()
+    try:
+        reading.send(None)
+    except StopIteration as end:
+        return cast(grpc.aio.AioRpcError, end.value)
+    reading.close()
+    raise AssertionError("the status of a call that has ended is known")
 
 
 def _error_from_rpc(error: grpc.aio.AioRpcError, address: str) -> DepthError:
