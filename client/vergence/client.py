@@ -50,6 +50,7 @@ class DepthClient:
         output: OutputFormat | None = None,
         iterations: int = 0,
         cold_iterations: int = 0,
+        weights_sha256: str = "",
         encoding: ImageEncoding = ImageEncoding.RAW,
         jpeg_quality: int = 90,
         stream_id: str | None = None,
@@ -71,6 +72,9 @@ class DepthClient:
             loses nothing) unless the server is on this machine, where it would only cost time.
         iterations, cold_iterations
             Refinements of a warm step and of a cold start; 0: the server's defaults.
+        weights_sha256
+            The weights that results must come from (:attr:`ModelInfo.weights_sha256`), where they
+            must be comparable; default: whatever the server runs, and the same after a resume.
         encoding
             How images travel: RAW is exact and costs bandwidth, PNG is exact and costs time.
         stream_id
@@ -80,8 +84,8 @@ class DepthClient:
         on_event
             Called in the event loop with what happens to the session; must not block.
 
-        Raises BadShape: the stream id. Entering raises BadCalibration, StreamExists, StreamLimit,
-        StateMemory, Draining, NotReady.
+        Raises BadShape: the stream id. Entering raises BadCalibration, ModelChanged, StreamExists,
+        StreamLimit, StateMemory, Draining, NotReady.
         """
         opening = pb.OpenStream(
             stream_id=_checked_id(uuid.uuid4().hex if stream_id is None else stream_id),
@@ -96,6 +100,7 @@ class DepthClient:
             ),
             iterations=iterations,
             cold_iterations=cold_iterations,
+            weights_sha256=weights_sha256,
         )
         return DepthSession(
             self._transport,

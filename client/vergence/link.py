@@ -128,6 +128,7 @@ class Link:
             if response is None or not response.HasField("opened"):
                 raise NotReady(f"expected the server to open the stream, got {response}")
             self._opening.resume_token = response.opened.resume_token
+            self._opening.weights_sha256 = response.opened.model.weights_sha256
             self._grace_s = response.opened.detach_grace_s
             again = self._user.attached(response.opened)
         except TimeoutError:

@@ -119,7 +119,7 @@ class FrameOutOfOrder(DepthError):
 
 
 class ModelChanged(DepthError):
-    """The state was made by other weights than the server now runs; reset or reopen the stream."""
+    """The server runs other weights than the stream's; open a new stream to go on with them."""
 
     code = ErrorCode.MODEL_CHANGED
 

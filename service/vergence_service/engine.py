@@ -8,6 +8,7 @@ from vergence_proto.errors import (
     DepthError,
     Draining,
     FrameTooLarge,
+    ModelChanged,
     NonFinite,
     NotReady,
     UnknownStream,
@@ -84,7 +85,11 @@ class DepthEngine:
     async def open(
         self, stream_id: str, opening: Opening, attachment: Attachment | None = None
     ) -> Stream:
-        """Raises NotReady, Draining, BadCalibration, FrameTooLarge, and as StreamTable.open."""
+        """Raises NotReady, Draining, ModelChanged, BadCalibration, FrameTooLarge.
+
+        And as StreamTable.open.
+        """
+        self._check_model(opening)
         rectifier = await self._rectifier(opening.rig)
         reserve = state_bytes(self.card, rectifier.rig.height, rectifier.rig.width)
         return self.streams.open(
@@ -94,8 +99,14 @@ class DepthEngine:
     def resume(
         self, stream_id: str, resume_token: bytes, opening: Opening, attachment: Attachment
     ) -> Stream:
-        """Attach to a stream that is open. Raises Draining, and as StreamTable.attach."""
+        """Attach to a stream that is open.
+
+        Raises NotReady, Draining, ModelChanged, and as StreamTable.attach.
+        """
         self._check_serving()
+        # Before the stream is looked for: a server that restarted has forgotten it, but that its
+        # successor would be another network's is what the client must hear.
+        self._check_model(opening)
         return self.streams.attach(stream_id, resume_token, opening, attachment)
 
     async def step(
@@ -184,6 +195,14 @@ class DepthEngine:
                 raise NotReady("the model is loading; try again", retry_after_s=1.0)
             case _Phase.DRAINING:
                 raise Draining("the server is shutting down; try another one")
+
+    def _check_model(self, opening: Opening) -> None:
+        if opening.weights_sha256 not in ("", self.card.weights_sha256):
+            raise ModelChanged(
+                f"expected a server with weights {opening.weights_sha256[:12]}, this one runs "
+                f"{self.card.name} with {self.card.weights_sha256[:12]}; open a new stream to go "
+                "on with those"
+            )
 
     async def _rectifier(self, rig: StereoRig) -> Rectifier:
         self._check_serving()

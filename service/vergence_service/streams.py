@@ -70,6 +70,7 @@ class Opening:
     output: OutputFormat = field(default_factory=OutputFormat)
     iterations: int = 0  # of a warm step; 0: the server's default
     cold_iterations: int = 0
+    weights_sha256: str = ""  # that all results must come from; empty: whatever the server runs
 
 
 @dataclass(slots=True, eq=False)

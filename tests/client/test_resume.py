@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from vergence import (
     DepthResult,
     DepthSession,
     EventKind,
+    ModelChanged,
     Origin,
     OutputFormat,
     PlaneEncoding,
@@ -184,6 +186,39 @@ async def test_a_server_that_restarted_has_forgotten_the_stream() -> None:
         proxy.lead_to(second.grpc_address)
         with pytest.raises(UnknownStream):
             await step(session, 2)
+
+
+class OtherWeights(RecallModel):
+    card = replace(RecallModel.card, weights_sha256="1" * 64)
+
+
+async def test_a_stream_does_not_go_on_with_other_weights() -> None:
+    async with (
+        running_server(RecallModel()) as first,
+        running_server(OtherWeights()) as second,
+        proxy_to(first.grpc_address) as proxy,
+        DepthClient(proxy.address) as client,
+        client.open_session(RIG) as session,
+    ):
+        await step(session, 1)
+        proxy.lead_to(second.grpc_address)
+        with pytest.raises(ModelChanged, match="expected a server with weights 0000"):
+            await step(session, 2)
+        async with client.open_session(RIG) as anew:
+            assert (await step(anew, 1)).step_count == 1
+
+
+async def test_a_session_may_ask_for_the_weights_that_its_results_come_from() -> None:
+    wanted = OtherWeights.card.weights_sha256
+    async with running_server(RecallModel()) as server, DepthClient(server.grpc_address) as client:
+        with pytest.raises(ModelChanged, match="this one runs recall with 0000"):
+            async with client.open_session(RIG, weights_sha256=wanted):
+                pass
+        assert (await client.server_info()).streams_open == 0
+    async with running_server(OtherWeights()) as server, DepthClient(server.grpc_address) as client:
+        async with client.open_session(RIG, weights_sha256=wanted) as session:
+            assert (await step(session, 1)).step_count == 1
+            assert session.model.weights_sha256 == wanted
 
 
 async def test_no_server_is_told_at_once_and_by_its_address() -> None:

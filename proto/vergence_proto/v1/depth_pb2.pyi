@@ -138,7 +138,7 @@ class StreamDepthResponse(_message.Message):
     def __init__(self, opened: _Optional[_Union[StreamOpened, _Mapping]] = ..., disparity: _Optional[_Union[DisparityMap, _Mapping]] = ..., frame_error: _Optional[_Union[FrameError, _Mapping]] = ..., frames_dropped: _Optional[_Union[FramesDropped, _Mapping]] = ..., pong: _Optional[_Union[Pong, _Mapping]] = ..., notice: _Optional[_Union[Notice, _Mapping]] = ...) -> None: ...
 
 class OpenStream(_message.Message):
-    __slots__ = ("stream_id", "resume_token", "rig", "axes", "delivery", "output", "iterations", "cold_iterations")
+    __slots__ = ("stream_id", "resume_token", "rig", "axes", "delivery", "output", "iterations", "cold_iterations", "weights_sha256")
     STREAM_ID_FIELD_NUMBER: _ClassVar[int]
     RESUME_TOKEN_FIELD_NUMBER: _ClassVar[int]
     RIG_FIELD_NUMBER: _ClassVar[int]
@@ -147,6 +147,7 @@ class OpenStream(_message.Message):
     OUTPUT_FIELD_NUMBER: _ClassVar[int]
     ITERATIONS_FIELD_NUMBER: _ClassVar[int]
     COLD_ITERATIONS_FIELD_NUMBER: _ClassVar[int]
+    WEIGHTS_SHA256_FIELD_NUMBER: _ClassVar[int]
     stream_id: str
     resume_token: bytes
     rig: StereoRig
@@ -155,7 +156,8 @@ class OpenStream(_message.Message):
     output: OutputFormat
     iterations: int
     cold_iterations: int
-    def __init__(self, stream_id: _Optional[str] = ..., resume_token: _Optional[bytes] = ..., rig: _Optional[_Union[StereoRig, _Mapping]] = ..., axes: _Optional[_Union[Axes, str]] = ..., delivery: _Optional[_Union[Delivery, str]] = ..., output: _Optional[_Union[OutputFormat, _Mapping]] = ..., iterations: _Optional[int] = ..., cold_iterations: _Optional[int] = ...) -> None: ...
+    weights_sha256: str
+    def __init__(self, stream_id: _Optional[str] = ..., resume_token: _Optional[bytes] = ..., rig: _Optional[_Union[StereoRig, _Mapping]] = ..., axes: _Optional[_Union[Axes, str]] = ..., delivery: _Optional[_Union[Delivery, str]] = ..., output: _Optional[_Union[OutputFormat, _Mapping]] = ..., iterations: _Optional[int] = ..., cold_iterations: _Optional[int] = ..., weights_sha256: _Optional[str] = ...) -> None: ...
 
 class StreamOpened(_message.Message):
     __slots__ = ("stream_id", "resume_token", "credit", "rig", "model", "resumed", "detach_grace_s", "idle_timeout_s", "last_frame_id")

@@ -103,6 +103,7 @@ class DepthCall:
             output=codec.output_format_from_proto(request.output),
             iterations=request.iterations,
             cold_iterations=request.cold_iterations,
+            weights_sha256=request.weights_sha256,
         )
         if request.resume_token:
             token = request.resume_token
