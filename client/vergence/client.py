@@ -85,7 +85,7 @@ class DepthClient:
             Called in the event loop with what happens to the session; must not block.
 
         Raises BadShape: the stream id. Entering raises BadCalibration, ModelChanged, StreamExists,
-        StreamLimit, StateMemory, Draining, NotReady.
+        Quota, StreamLimit, StateMemory, Draining, NotReady.
         """
         opening = pb.OpenStream(
             stream_id=_checked_id(uuid.uuid4().hex if stream_id is None else stream_id),

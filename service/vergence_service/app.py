@@ -64,6 +64,7 @@ async def running(
     metrics = Metrics(registry)
     streams = StreamTable(
         capacity=settings.streams.capacity,
+        per_client=settings.streams.per_client,
         max_state_bytes=settings.streams.max_state_mib * _MIB,
         idle_timeout_s=settings.streams.idle_timeout_s,
         idle_notice_s=settings.streams.idle_notice_s,

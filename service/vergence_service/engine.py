@@ -83,21 +83,38 @@ class DepthEngine:
             attachment.notify(notice)
 
     async def open(
-        self, stream_id: str, opening: Opening, attachment: Attachment | None = None
+        self,
+        stream_id: str,
+        opening: Opening,
+        *,
+        attachment: Attachment | None = None,
+        client: str = "",
     ) -> Stream:
-        """Raises NotReady, Draining, ModelChanged, BadCalibration, FrameTooLarge.
+        """A new stream, which counts to the share of ``client``, an address.
 
-        And as StreamTable.open.
+        Raises NotReady, Draining, ModelChanged, BadCalibration, FrameTooLarge, and as
+        StreamTable.open.
         """
         self._check_model(opening)
         rectifier = await self._rectifier(opening.rig)
         reserve = state_bytes(self.card, rectifier.rig.height, rectifier.rig.width)
         return self.streams.open(
-            stream_id, opening, rectifier, state_bytes=reserve, attachment=attachment
+            stream_id,
+            opening,
+            rectifier,
+            state_bytes=reserve,
+            attachment=attachment,
+            client=client,
         )
 
     def resume(
-        self, stream_id: str, resume_token: bytes, opening: Opening, attachment: Attachment
+        self,
+        stream_id: str,
+        resume_token: bytes,
+        opening: Opening,
+        *,
+        attachment: Attachment,
+        client: str = "",
     ) -> Stream:
         """Attach to a stream that is open.
 
@@ -107,7 +124,9 @@ class DepthEngine:
         # Before the stream is looked for: a server that restarted has forgotten it, but that its
         # successor would be another network's is what the client must hear.
         self._check_model(opening)
-        return self.streams.attach(stream_id, resume_token, opening, attachment)
+        return self.streams.attach(
+            stream_id, resume_token, opening, attachment=attachment, client=client
+        )
 
     async def step(
         self,
@@ -135,7 +154,7 @@ class DepthEngine:
         Raises NotReady, Draining, BadCalibration, FrameTooLarge.
         """
         rectifier = await self._rectifier(opening.rig)
-        return Stream("", b"", opening, rectifier, 0, None, self._clock())
+        return Stream("", "", b"", opening, rectifier, 0, None, self._clock())
 
     async def step_apart(self, stream: Stream, decode: Callable[[], StereoFrame]) -> DisparityMap:
         """As :meth:`step`, of a stream that :meth:`open_apart` made."""

@@ -76,6 +76,7 @@ async def serving_http(
                     store,
                     limits=QueueLimits(
                         waiting=batch.waiting,
+                        waiting_per_client=batch.waiting_per_client,
                         keep_s=batch.keep_h * 3600,
                         disk_bytes=batch.disk_mib * _MIB,
                     ),

@@ -16,6 +16,7 @@ from vergence_proto.errors import (
     ModelFailed,
     NotReady,
     QueueFull,
+    Quota,
     SequenceNotDone,
 )
 from vergence_proto.layouts import StereoSource
@@ -48,6 +49,7 @@ _USUAL_JOB_S = 2.0
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QueueLimits:
     waiting: int  # jobs, the running ones included
+    waiting_per_client: int | None
     keep_s: float  # what has ended
     disk_bytes: int  # of all jobs together
 
@@ -81,12 +83,12 @@ class JobQueue:
     def __init__(self, engine: DepthEngine, store: JobStore, *, limits: QueueLimits) -> None:
         self._engine = engine
         self._store = store
-        self._max_waiting = limits.waiting
+        self._limits = limits
         self._shelf = JobShelf(store, keep_s=limits.keep_s, disk_bytes=limits.disk_bytes)
         self._running: dict[str, _Running] = {}  # at most one is stepped, one is being put away
         self._leaving = False  # the server is shutting down
         self._last_job_s = _USUAL_JOB_S
-        self._uploads = 0
+        self._uploads: list[str] = []  # whose they are
         self._tasks: list[asyncio.Task[None]] = []
 
     async def __aenter__(self) -> Self:
@@ -106,17 +108,13 @@ class JobQueue:
         ]
 
     @asynccontextmanager
-    async def place(self) -> AsyncIterator[Path]:
+    async def place(self, client: str) -> AsyncIterator[Path]:
         """A place in the queue, and a folder to receive an upload in, removed if not accepted.
 
-        Raises QueueFull.
+        ``client`` is the address that it comes from. Raises QueueFull, Quota.
         """
-        if len(self._shelf.unfinished()) + self._uploads >= self._max_waiting:
-            raise QueueFull(
-                f"{self._max_waiting} sequences are waiting, as many as may; try again later",
-                retry_after_s=self._usual_job_s(),
-            )
-        self._uploads += 1
+        self._check_room(client)
+        self._uploads.append(client)
         try:
             folder = await asyncio.to_thread(self._store.new_folder)
             try:
@@ -124,9 +122,27 @@ class JobQueue:
             finally:
                 await asyncio.to_thread(remove_folder, folder)
         finally:
-            self._uploads -= 1
+            self._uploads.remove(client)
 
-    async def accept(self, folder: Path, wanted: str | None, options: JobOptions) -> JobStatus:
+    def _check_room(self, client: str) -> None:
+        limits = self._limits
+        waiting = [*(job.client for job in self._shelf.unfinished()), *self._uploads]
+        if len(waiting) >= limits.waiting:
+            raise QueueFull(
+                f"{limits.waiting} sequences are waiting, as many as may; try again later",
+                retry_after_s=self._usual_job_s(),
+            )
+        theirs = waiting.count(client)
+        if limits.waiting_per_client is not None and theirs >= limits.waiting_per_client:
+            raise Quota(
+                f"{theirs} sequences of {client} are waiting, as many as of one client may; try "
+                "again later",
+                retry_after_s=self._usual_job_s(),
+            )
+
+    async def accept(
+        self, folder: Path, wanted: str | None, options: JobOptions, *, client: str
+    ) -> JobStatus:
         """Take the sequence below ``folder``/input; from the return on it will not be lost.
 
         ``wanted`` is KIND:PATH, and needed where there are several. Raises BadSequence, QueueFull,
@@ -142,6 +158,7 @@ class JobQueue:
             frames=len(source),
             source_fps=source.fps,
             created_s=time.time(),
+            client=client,
             options=options,
             disk_bytes=uploaded + _result_bytes(source, options),
         )

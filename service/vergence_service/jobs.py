@@ -57,6 +57,7 @@ class Job:
     frames: int
     source_fps: float | None
     created_s: float  # Unix time, which outlives a restart
+    client: str = ""  # the address that it came from
     options: JobOptions = field(default_factory=JobOptions)
     state: JobState = JobState.QUEUED
     attempts: int = 0  # that ended with the server

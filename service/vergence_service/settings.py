@@ -47,6 +47,7 @@ class BatchSettings(_Section):
         default=None, description="of jobs and results; $XDG_STATE_HOME/vergence/batch"
     )
     waiting: PositiveInt = Field(default=64, description="sequences, the running one included")
+    waiting_per_client: PositiveInt | None = Field(default=None, description="those of one address")
     keep_h: PositiveFloat = Field(default=24.0, description="results, unless space runs short")
     disk_mib: PositiveInt = Field(default=20_480, description="of all jobs together")
     max_upload_mib: PositiveInt = 4096
@@ -95,6 +96,9 @@ class ModelSettings(_Section):
 
 class StreamSettings(_Section):
     capacity: PositiveInt = 16
+    per_client: PositiveInt | None = Field(
+        default=None, description="streams of one address, over gRPC and HTTP"
+    )
     max_state_mib: PositiveInt = 512
     max_pixels: PositiveInt = Field(default=4_000_000, description="of one image")
     idle_timeout_s: PositiveFloat = 60.0

@@ -16,6 +16,7 @@ from vergence_proto.errors import (
     BadShape,
     DepthError,
     FrameOutOfOrder,
+    Quota,
     StateMemory,
     StreamExists,
     StreamExpired,
@@ -78,6 +79,7 @@ class Stream:
     """One client's sequence: its rig, its recurrent state, its place in the order of frames."""
 
     stream_id: str
+    client: str  # whose share it counts to; empty: nobody's
     resume_token: bytes
     opening: Opening
     rectifier: Rectifier
@@ -132,6 +134,7 @@ class StreamTable:
         self,
         *,
         capacity: int,
+        per_client: int | None,
         max_state_bytes: int,
         idle_timeout_s: float,
         idle_notice_s: float,
@@ -142,6 +145,7 @@ class StreamTable:
         self.capacity = capacity
         self.idle_timeout_s = idle_timeout_s
         self.detach_grace_s = detach_grace_s
+        self._per_client = per_client
         self._max_state_bytes = max_state_bytes
         self._idle_notice_s = idle_notice_s
         self._clock = clock
@@ -163,10 +167,11 @@ class StreamTable:
         *,
         state_bytes: int,
         attachment: Attachment | None,
+        client: str,
     ) -> Stream:
         """Make a new stream; an empty id lets the server choose one.
 
-        Raises BadShape (the id), StreamExists, StreamLimit, StateMemory.
+        Raises BadShape (the id), StreamExists, Quota, StreamLimit, StateMemory.
         """
         self.sweep()
         stream_id = stream_id or f"s-{secrets.token_hex(8)}"
@@ -180,22 +185,30 @@ class StreamTable:
                 f"stream {stream_id!r} is open; resume it with its token, close it, or choose "
                 "another id"
             )
+        theirs = [each for each in self._streams.values() if client and each.client == client]
+        if self._per_client is not None and len(theirs) >= self._per_client:
+            raise Quota(
+                f"{client} holds {len(theirs)} streams, as many as one client may; close one, or "
+                "try again later",
+                retry_after_s=self._next_expiry_s(theirs),
+            )
         if len(self._streams) >= self.capacity:
             raise StreamLimit(
                 f"the server holds {self.capacity} streams, as many as it may; close one, or "
                 "try again later",
-                retry_after_s=self._next_expiry_s(),
+                retry_after_s=self._next_expiry_s(self._streams.values()),
             )
         reserved = self._reserved_bytes()
         if reserved + state_bytes > self._max_state_bytes:
             raise StateMemory(
                 f"the stream's state takes {state_bytes} bytes; {reserved} of "
                 f"{self._max_state_bytes} are taken",
-                retry_after_s=self._next_expiry_s(),
+                retry_after_s=self._next_expiry_s(self._streams.values()),
             )
         self._expired_s.pop(stream_id, None)
         stream = Stream(
             stream_id,
+            client,
             secrets.token_bytes(16),
             opening,
             rectifier,
@@ -208,7 +221,13 @@ class StreamTable:
         return stream
 
     def attach(
-        self, stream_id: str, resume_token: bytes, opening: Opening, attachment: Attachment
+        self,
+        stream_id: str,
+        resume_token: bytes,
+        opening: Opening,
+        *,
+        attachment: Attachment,
+        client: str,
     ) -> Stream:
         """Give an open stream to a new connection; the newest attachment wins.
 
@@ -228,6 +247,7 @@ class StreamTable:
             )
         stream.opening = opening
         stream.attachment = attachment
+        stream.client = client  # which may have come back by another network
         if stream.state is not None:
             stream.origin = Origin.RESUMED
         self.touch(stream)
@@ -297,8 +317,8 @@ class StreamTable:
         patience_s = self.idle_timeout_s if stream.attachment else self.detach_grace_s
         return stream.active_s + patience_s
 
-    def _next_expiry_s(self) -> float:
-        return min(map(self._expiry_s, self._streams.values()), default=0.0) - self._clock()
+    def _next_expiry_s(self, streams: Iterable[Stream]) -> float:
+        return min(map(self._expiry_s, streams), default=0.0) - self._clock()
 
     def _reserved_bytes(self) -> int:
         return sum(stream.state_bytes for stream in self._streams.values())

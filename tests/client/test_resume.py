@@ -215,10 +215,13 @@ async def test_a_session_may_ask_for_the_weights_that_its_results_come_from() ->
             async with client.open_session(RIG, weights_sha256=wanted):
                 pass
         assert (await client.server_info()).streams_open == 0
-    async with running_server(OtherWeights()) as server, DepthClient(server.grpc_address) as client:
-        async with client.open_session(RIG, weights_sha256=wanted) as session:
-            assert (await step(session, 1)).step_count == 1
-            assert session.model.weights_sha256 == wanted
+    async with (
+        running_server(OtherWeights()) as server,
+        DepthClient(server.grpc_address) as client,
+        client.open_session(RIG, weights_sha256=wanted) as session,
+    ):
+        assert (await step(session, 1)).step_count == 1
+        assert session.model.weights_sha256 == wanted
 
 
 async def test_no_server_is_told_at_once_and_by_its_address() -> None:

@@ -1,12 +1,15 @@
 """Bad input: each kind has its own clear error, and harms neither its stream nor the neighbours."""
 
+import ast
 import asyncio
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import cv2
 import grpc
+import httpx
 import numpy as np
 import pytest
 from google.rpc import error_details_pb2
@@ -15,8 +18,9 @@ from tests.support.frames import RIG, frame_message, make_frame, open_message
 from tests.support.models import NOT_FINITE, RAISES, RecallModel
 from tests.support.server import RawCall, connected, raw_stream, running_server
 from tests.support.status import reason_of, unpack_detail
+from vergence import DepthClient
 from vergence_proto import codec
-from vergence_proto.errors import ErrorCode
+from vergence_proto.errors import ERROR_CLASSES, BadImage, BadPose, ErrorCode, Quota
 from vergence_proto.types import ImageEncoding, StereoRig
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.app import Running
@@ -27,6 +31,19 @@ Spoil = Callable[[pb.Frame], object]
 
 def test_every_error_code_has_a_grpc_status() -> None:
     assert set(GRPC_STATUS) == set(ErrorCode)
+
+
+def test_every_error_code_is_given_by_something() -> None:
+    called = {
+        call.func.id
+        for path in (Path(__file__).parents[2] / "service" / "vergence_service").rglob("*.py")
+        for call in ast.walk(ast.parse(path.read_text("utf-8")))
+        if isinstance(call, ast.Call) and isinstance(call.func, ast.Name)
+    }
+    # What is wrong with a message is found by the contract, for both sides.
+    by_the_contract = {BadImage, BadPose}
+    missing = {each for each in ERROR_CLASSES.values() if each.__name__ not in called}
+    assert missing <= by_the_contract
 
 
 def truncated_jpeg(frame: pb.Frame) -> None:
@@ -267,6 +284,35 @@ async def test_a_full_server_says_when_to_come_back() -> None:
     retry = error_details_pb2.RetryInfo()
     unpack_detail(failure.value, retry)
     assert 0 < retry.retry_delay.seconds <= 60
+
+
+async def test_a_client_that_has_its_share_is_told_so_and_leaves_room_to_others() -> None:
+    async with (
+        running_server(RecallModel(), streams__per_client=1) as server,
+        raw_stream(server, "mine") as mine,
+        connected(server) as stub,
+    ):
+        with pytest.raises(grpc.aio.AioRpcError) as failure:
+            await RawCall(stub.StreamDepth()).ask(open_message())
+        assert reason_of(failure.value) == "QUOTA"
+        retry = error_details_pb2.RetryInfo()
+        unpack_detail(failure.value, retry)
+        assert 0 < retry.retry_delay.seconds <= 60
+        # A share is an address's, by whatever door; to come back to what one has takes no other.
+        async with DepthClient(f"http://{server.http_address}") as same:
+            with pytest.raises(Quota, match=r"127\.0\.0\.1 holds 1 streams"):
+                async with same.open_session(RIG):
+                    pass
+        token = mine.opened.resume_token
+        async with raw_stream(server, "mine", resume_token=token) as again:
+            assert (await again.ask(frame_message(make_frame(1)))).HasField("disparity")
+        elsewhere = httpx.AsyncHTTPTransport(local_address="127.0.0.2")
+        async with httpx.AsyncClient(transport=elsewhere) as other:
+            url = f"http://{server.http_address}/v1/streams"
+            body = open_message("theirs").SerializeToString()
+            async with other.stream("POST", url, content=body) as answer:
+                assert answer.status_code == 200
+                assert server.engine.streams.get("theirs").client == "127.0.0.2"
 
 
 async def test_states_take_no_more_memory_than_allowed() -> None:

@@ -265,6 +265,7 @@ async def test_before_the_model_is_loaded_every_opening_is_refused() -> None:
     clock = ManualClock()
     streams = StreamTable(
         capacity=1,
+        per_client=None,
         max_state_bytes=1 << 20,
         idle_timeout_s=60,
         idle_notice_s=10,

@@ -237,6 +237,26 @@ async def test_a_full_queue_says_when_to_come_back_and_takes_the_next_one_then()
         await submit(client, ARCHIVE)
 
 
+async def test_a_client_that_has_its_share_of_the_queue_leaves_the_rest_to_others() -> None:
+    model = RecallModel()
+    async with running_server(model, batch__waiting_per_client=1) as server:
+        elsewhere = httpx.AsyncHTTPTransport(local_address="127.0.0.2")
+        base = f"http://{server.http_address}"
+        async with (
+            http_to(server) as client,
+            httpx.AsyncClient(transport=elsewhere, base_url=base) as other,
+        ):
+            with model.busy():
+                mine = await submit(client, ARCHIVE)
+                answer = await client.post("/v1/sequences", content=ARCHIVE, headers=ZIP)
+                assert (answer.status_code, reason_of(answer)) == (429, "QUOTA")
+                assert int(answer.headers["Retry-After"]) >= 1
+                theirs = await submit(other, ARCHIVE)
+            for job in (mine, theirs):
+                assert (await ended(client, job["id"]))["state"] == "done"
+            await submit(client, ARCHIVE)
+
+
 async def test_a_pair_is_answered_at_once() -> None:
     frame = FRAMES[0]
     files = {"left": png(frame.left), "right": png(frame.right)}

@@ -10,6 +10,7 @@ from tests.support.frames import RIG
 from tests.support.server import ManualClock
 from vergence_proto.errors import (
     DepthError,
+    Quota,
     StateMemory,
     StreamExists,
     StreamExpired,
@@ -22,7 +23,7 @@ from vergence_service.metrics import Metrics
 from vergence_service.rectify import Rectifier
 from vergence_service.streams import Notice, Opening, Stream, StreamTable
 
-CAPACITY, MEMORY, STATE = 3, 1000, 400
+CAPACITY, PER_CLIENT, MEMORY, STATE = 3, 2, 1000, 400
 IDLE_S, NOTICE_S, GRACE_S, TOMBSTONE_S = 60.0, 10.0, 10.0, 300.0
 RIG_OPENING = Opening(StereoRig.from_rectified(RIG))
 RECTIFIER = Rectifier.of(RIG_OPENING.rig)
@@ -51,6 +52,7 @@ class StreamTableMachine(RuleBasedStateMachine):
         self.registry = CollectorRegistry()
         self.table = StreamTable(
             capacity=CAPACITY,
+            per_client=PER_CLIENT,
             max_state_bytes=MEMORY,
             idle_timeout_s=IDLE_S,
             idle_notice_s=NOTICE_S,
@@ -58,9 +60,10 @@ class StreamTableMachine(RuleBasedStateMachine):
             clock=self.clock,
             metrics=Metrics(self.registry),
         )
-        # What the table should hold: per open stream its size and since when it is unused; when
-        # each expired one expired; and who is attached to what.
+        # What the table should hold: per open stream its size, whose it is and since when it is
+        # unused; when each expired one expired; and who is attached to what.
         self.sizes: dict[str, int] = {}
+        self.clients: dict[str, str] = {}
         self.used_s: dict[str, float] = {}
         self.expired_s: dict[str, float] = {}
         self.owner: dict[str, Connection | None] = {}
@@ -75,33 +78,49 @@ class StreamTableMachine(RuleBasedStateMachine):
                 self.expired_s[stream_id] = self.clock.now_s
 
     def forget(self, stream_id: str) -> None:
-        for table in (self.sizes, self.used_s, self.owner, self.streams):
+        for table in (self.sizes, self.clients, self.used_s, self.owner, self.streams):
             table.pop(stream_id)
 
-    @rule(target=connections, stream_id=st.sampled_from("abcde"), size=st.sampled_from([1, STATE]))
-    def open(self, stream_id: str, size: int) -> Connection:
+    def open_in_table(
+        self, stream_id: str, size: int, client: str, connection: Connection
+    ) -> Stream:
+        return self.table.open(
+            stream_id,
+            RIG_OPENING,
+            RECTIFIER,
+            state_bytes=size,
+            attachment=connection,
+            client=client,
+        )
+
+    @rule(
+        target=connections,
+        stream_id=st.sampled_from("abcde"),
+        size=st.sampled_from([1, STATE]),
+        client=st.sampled_from(["", "10.0.0.1", "10.0.0.2"]),
+    )
+    def open(self, stream_id: str, size: int, client: str) -> Connection:
         self.table.sweep()
         self.settle()
         connection = Connection()
         expected: type[DepthError] | None = None
         if stream_id in self.sizes:
             expected = StreamExists
+        elif client and list(self.clients.values()).count(client) == PER_CLIENT:
+            expected = Quota
         elif len(self.sizes) == CAPACITY:
             expected = StreamLimit
         elif sum(self.sizes.values()) + size > MEMORY:
             expected = StateMemory
         if expected is not None:
             with pytest.raises(expected) as refusal:
-                self.table.open(
-                    stream_id, RIG_OPENING, RECTIFIER, state_bytes=size, attachment=connection
-                )
+                self.open_in_table(stream_id, size, client, connection)
             retry_s = refusal.value.retry_after_s
             assert retry_s is None or 0 < retry_s <= IDLE_S
             return connection
-        stream = self.table.open(
-            stream_id, RIG_OPENING, RECTIFIER, state_bytes=size, attachment=connection
-        )
+        stream = self.open_in_table(stream_id, size, client, connection)
         self.sizes[stream_id] = size
+        self.clients[stream_id] = client
         self.used_s[stream_id] = self.clock.now_s
         self.expired_s.pop(stream_id, None)
         self.owner[stream_id] = connection
@@ -131,26 +150,35 @@ class StreamTableMachine(RuleBasedStateMachine):
                 self.owner[stream_id] = None
                 self.used_s[stream_id] = self.clock.now_s
 
-    @rule(target=connections, stream_id=st.sampled_from("abcde"), right_token=st.booleans())
-    def resume(self, stream_id: str, right_token: bool) -> Connection:
+    @rule(
+        target=connections,
+        stream_id=st.sampled_from("abcde"),
+        right_token=st.booleans(),
+        client=st.sampled_from(["10.0.0.1", "10.0.0.3"]),
+    )
+    def resume(self, stream_id: str, right_token: bool, client: str) -> Connection:
         self.settle()
         connection = Connection()
         if stream_id not in self.sizes:
             with pytest.raises((StreamExpired, UnknownStream)):
-                self.table.attach(stream_id, b"any", RIG_OPENING, connection)
+                self.attach(stream_id, b"any", client, connection)
             return connection
         stream, before = self.streams[stream_id], self.owner[stream_id]
         if not right_token:
             with pytest.raises(StreamExists):
-                self.table.attach(stream_id, b"guess", RIG_OPENING, connection)
+                self.attach(stream_id, b"guess", client, connection)
             assert stream.attachment is before
             return connection
-        self.table.attach(stream_id, stream.resume_token, RIG_OPENING, connection)
+        self.attach(stream_id, stream.resume_token, client, connection)
+        self.clients[stream_id] = client
         if before is not None:
             assert isinstance(before.errors[-1], Superseded)
         self.owner[stream_id] = connection
         self.used_s[stream_id] = self.clock.now_s
         return connection
+
+    def attach(self, stream_id: str, token: bytes, client: str, connection: Connection) -> None:
+        self.table.attach(stream_id, token, RIG_OPENING, attachment=connection, client=client)
 
     @rule(stream_id=st.sampled_from("abcde"))
     def close(self, stream_id: str) -> None:

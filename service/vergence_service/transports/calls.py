@@ -26,8 +26,18 @@ class OpenCalls:
         self,
         requests: AsyncIterator[pb.StreamDepthRequest],
         write: Callable[[pb.StreamDepthResponse], Awaitable[None]],
+        *,
+        client: str,
     ) -> DepthCall:
-        return DepthCall(self._engine, requests, write, limits=self.limits, clock=self._clock)
+        """``client`` is the address that the call comes from; empty where nobody knows."""
+        return DepthCall(
+            self._engine,
+            requests,
+            write,
+            client=client,
+            limits=self.limits,
+            clock=self._clock,
+        )
 
     async def run(self, call: DepthCall) -> None:
         """Serve the call to its end. Raises the DepthError that it ends with, if any."""

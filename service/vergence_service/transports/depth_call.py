@@ -31,12 +31,14 @@ class DepthCall:
         requests: AsyncIterator[pb.StreamDepthRequest],
         write: Callable[[pb.StreamDepthResponse], Awaitable[None]],
         *,
+        client: str,
         limits: StreamLimits,
         clock: Callable[[], float],
     ) -> None:
         self._engine = engine
         self._requests = requests
         self._write = write
+        self._client = client
         self._limits = limits
         self._clock = clock
         self._outbox = Outbox(write, clock=clock, metrics=engine.metrics)
@@ -106,9 +108,18 @@ class DepthCall:
             weights_sha256=request.weights_sha256,
         )
         if request.resume_token:
-            token = request.resume_token
-            return self._engine.resume(request.stream_id, token, opening, self), True
-        return await self._engine.open(request.stream_id, opening, self), False
+            resumed = self._engine.resume(
+                request.stream_id,
+                request.resume_token,
+                opening,
+                attachment=self,
+                client=self._client,
+            )
+            return resumed, True
+        opened = await self._engine.open(
+            request.stream_id, opening, attachment=self, client=self._client
+        )
+        return opened, False
 
     def _opened(self, stream: Stream, resumed: bool) -> pb.StreamOpened:
         return pb.StreamOpened(

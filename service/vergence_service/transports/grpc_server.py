@@ -2,6 +2,7 @@
 
 from collections.abc import AsyncIterator
 from typing import Self
+from urllib.parse import unquote
 
 import grpc
 from google.protobuf.message import DecodeError
@@ -41,6 +42,12 @@ async def _messages(
         raise BadShape("expected messages of vergence.v1, got bytes that are none") from None
 
 
+def _host_of(peer: str) -> str:
+    """The address in gRPC's ``ipv4:HOST:PORT``, ``ipv6:%5BHOST%5D:PORT`` or ``unix:PATH``."""
+    _, _, place_of_client = unquote(peer).partition(":")
+    return place_of_client.rpartition(":")[0].strip("[]")
+
+
 class DepthServicer(depth_pb2_grpc.DepthServiceServicer):
     """Translates each call to the engine's words."""
 
@@ -53,7 +60,8 @@ class DepthServicer(depth_pb2_grpc.DepthServiceServicer):
     ) -> None:
         async with errors_as_status(context):
             requests = _messages(request_iterator)
-            await self.calls.run(self.calls.make(requests, context.write))
+            client = _host_of(context.peer())
+            await self.calls.run(self.calls.make(requests, context.write, client=client))
 
     async def GetServerInfo(  # noqa: N802
         self, request: pb.GetServerInfoRequest, context: Context

@@ -19,6 +19,7 @@ from vergence_service.transports.http_uploads import (
     ARCHIVE_TYPES,
     FORM_TYPE,
     UploadLimits,
+    client_of,
     receive_sequence,
 )
 
@@ -176,9 +177,10 @@ def sequence_routes(
             outputs=tuple(dict.fromkeys(query.output)),
             metrics=query.metrics,
         )
-        async with queue.place() as folder:
+        client = client_of(request)
+        async with queue.place(client) as folder:
             await receive_sequence(request, folder, limits)
-            status = await queue.accept(folder, query.source, options)
+            status = await queue.accept(folder, query.source, options, client=client)
         job_id = status.job.job_id
         if query.wait:
             while not (status := queue.status(job_id)).job.ended and not stopping.is_set():

@@ -21,6 +21,7 @@ from vergence_proto.http_records import (
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.transports.calls import OpenCalls
 from vergence_service.transports.http_errors import PROBLEM_RESPONSE, log
+from vergence_service.transports.http_uploads import client_of
 from vergence_service.transports.unary import UnaryMethods
 
 _BODY: dict[str, Any] = {
@@ -49,7 +50,7 @@ def stream_routes(calls: OpenCalls, unary: UnaryMethods) -> APIRouter:
     )
     async def open_stream(request: Request) -> StreamingResponse:
         """Open or resume a stream with a StreamDepthRequest; its answers come as records."""
-        call = _HttpCall(calls)
+        call = _HttpCall(calls, client=client_of(request))
         first = await call.begin(await _message(request, pb.StreamDepthRequest, calls))
         open_calls[call.call_id] = call
 
@@ -99,8 +100,9 @@ def stream_routes(calls: OpenCalls, unary: UnaryMethods) -> APIRouter:
 class _HttpCall:
     """Translates between requests and a DepthCall."""
 
-    def __init__(self, calls: OpenCalls) -> None:
+    def __init__(self, calls: OpenCalls, *, client: str) -> None:
         self.call_id = secrets.token_urlsafe(16)
+        self._client = client
         self._calls = calls
         # One of each: whoever is ahead waits for the other, as on a connection that is full.
         self._incoming: asyncio.Queue[pb.StreamDepthRequest] = asyncio.Queue(1)
@@ -111,7 +113,7 @@ class _HttpCall:
 
     async def begin(self, opening: pb.StreamDepthRequest) -> bytes:
         """Start the call; the first record of its answer. Raises the error of the opening."""
-        self._call = self._calls.make(self._requests(opening), self._write)
+        self._call = self._calls.make(self._requests(opening), self._write, client=self._client)
         self._task = asyncio.create_task(self._run(), name="HTTP call")
         first = await self._outgoing.get()
         if self._refusal is not None:

@@ -40,7 +40,7 @@ class ZenohCall:
         self._attachment_id = attachment_id
         self._calls = calls
         self._live = opening.delivery != pb.DELIVERY_EVERY
-        self._call = calls.make(self._requests(), self._write)
+        self._call = calls.make(self._requests(), self._write, client="")
         self._inbox = Inbox(
             attachment_id,
             bulky=pb.Frame,
