@@ -1,0 +1,122 @@
+r"""``python -m vergence_models.studies --json FILE``: the paper's studies, on our networks.
+
+    python -m vergence_models.studies --json out/studies.json
+    python -m vergence_models.studies --json out/studies.json --studies times     # that table anew
+    python -m vergence_models.studies --json FILE --weights DIR DIR --run runs/lite \
+        --data sceneflow:BENCH --kitti vergence:DIR
+
+Markdown and PNG plots are written beside FILE. A study is written down as soon as it is done;
+those in FILE that are not run again are kept, with the training state they were made with. The
+networks are the graphs of ``--weights``, and of ``--run`` (by PyTorch) the iteration counts that
+no graph has. The held-out clips are rendered into ``--cache`` once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from functools import partial
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn
+
+from vergence_models.evaluate import WEIGHTS
+from vergence_models.runs import RunError
+from vergence_models.studies.bench import Bench
+from vergence_models.studies.contenders import gather_contenders, missing_tiers
+from vergence_models.studies.footage import ClipSettings, group_on_disk
+from vergence_models.studies.plan import STUDIES, Study, kitti, on_data
+from vergence_models.studies.plots import draw_plots
+from vergence_models.studies.tables import (
+    StudyFileError,
+    Table,
+    markdown,
+    read_tables,
+    write_tables,
+)
+from vergence_proto.layouts import LayoutError
+from vergence_proto.model_io import ManifestError
+
+log = logging.getLogger("vergence_models.studies")
+QUICK = ClipSettings(clips=2, frames=8)
+
+
+def parse(arguments: list[str] | None) -> argparse.Namespace:
+    usual = ClipSettings()
+    parser = argparse.ArgumentParser(
+        prog="vergence_models.studies",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("--json", type=Path, required=True, help="results; Markdown and PNGs go beside it")
+    add("--studies", nargs="+", choices=list(STUDIES), default=None, help="by default all")
+    add("--weights", type=Path, nargs="+", default=[WEIGHTS], help="folders with a manifest")
+    add("--run", type=Path, nargs="*", default=[], help="training runs, computed by PyTorch")
+    add("--data", nargs="*", default=[], help="KIND:PATH, each a table of its own")
+    add("--kitti", help="KIND:PATH of KITTI odometry with truth, by the paper's protocol")
+    add("--cache", type=Path, default=Path("out/study-clips"), help="of rendered clips")
+    add("--clips", type=int, default=usual.clips)
+    add("--frames", type=int, default=usual.frames, help="of each clip or sequence, at most")
+    add("--textures", type=Path, help="folder of photographs for the clips")
+    add("--quick", action="store_true", help=f"{QUICK.clips} clips of {QUICK.frames} frames")
+    add("--workers", type=int, default=2, help="processes that render")
+    add("--threads", type=int, default=2, help="of each network")
+    return parser.parse_args(arguments)
+
+
+def chosen(given: argparse.Namespace, frames: int) -> dict[str, Study]:
+    """Name -> study, sources on disk included."""
+    extra: dict[str, Study] = {
+        name: partial(on_data, group=group_on_disk(spec, frames), name=name)
+        for name, spec in ((f"data_{Path(spec).stem}", spec) for spec in given.data)
+    }
+    if given.kitti:
+        extra["kitti"] = partial(kitti, group=group_on_disk(given.kitti, frames))
+    return {name: STUDIES[name] for name in given.studies or STUDIES} | extra
+
+
+def report(tables: dict[str, Table], missing: list[str], path: Path) -> None:
+    """Write everything that is known by now."""
+    order = [*STUDIES, *sorted(set(tables) - set(STUDIES))]
+    known = [tables[name] for name in order if name in tables]
+    write_tables(path, known)
+    drawn = draw_plots(known, path.parent)
+    path.with_suffix(".md").write_text(markdown(known, missing, drawn), "utf-8")
+
+
+def main(arguments: list[str] | None = None) -> None:
+    given = parse(arguments)
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    settings = (
+        QUICK
+        if given.quick
+        else ClipSettings(clips=given.clips, frames=given.frames, textures=given.textures)
+    )
+    given.json.parent.mkdir(parents=True, exist_ok=True)
+    columns = (SpinnerColumn(), *Progress.get_default_columns()[:1], TimeElapsedColumn())
+    try:
+        tables = read_tables(given.json)
+        contenders = gather_contenders(given.weights, given.run, threads=given.threads)
+        missing = missing_tiers(contenders)
+        with Progress(*columns, console=Console(stderr=True)) as progress:
+            bench = Bench(
+                contenders,
+                settings=settings,
+                cache=given.cache,
+                workers=given.workers,
+                progress=progress,
+            )
+            for name, study in chosen(given, settings.frames).items():
+                log.info("study: %s", name)
+                tables[name] = study(bench)
+                report(tables, missing, given.json)
+    except (ManifestError, RunError, LayoutError, StudyFileError, FileNotFoundError) as error:
+        sys.exit(f"vergence_models.studies: {error}")
+    sys.stdout.write(given.json.with_suffix(".md").read_text("utf-8"))
+
+
+if __name__ == "__main__":
+    main()

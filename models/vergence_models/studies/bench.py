@@ -1,0 +1,96 @@
+"""Runs methods over groups of footage, once each, however many studies ask."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from rich.progress import Progress
+
+from vergence_models.methods import Method
+from vergence_models.stepping import Footage, View
+from vergence_models.studies.contenders import Contender
+from vergence_models.studies.footage import ClipSettings, Group, clips_at
+from vergence_models.tally import Tally
+from vergence_proto.geometry import RectifiedRig
+
+
+class Bench:
+    """The contenders, the clips, and what is known of them so far."""
+
+    def __init__(
+        self,
+        contenders: Sequence[Contender],
+        *,
+        settings: ClipSettings,
+        cache: Path,
+        workers: int,
+        progress: Progress,
+    ) -> None:
+        self.contenders = contenders
+        self.settings = settings
+        self._cache = cache
+        self._workers = workers
+        self._progress = progress
+        self._clips: dict[int, Group] = {}
+        self._tallies: dict[tuple[str, str], Tally] = {}
+
+    def clips(self, speed: int) -> Group:
+        """The held-out clips at one speed, rendered if need be."""
+        if speed not in self._clips:
+            self._progress.stop()  # rendering shows its own
+            self._clips[speed] = clips_at(speed, self.settings, self._cache, workers=self._workers)
+            self._progress.start()
+        return self._clips[speed]
+
+    def tallies(self, group: Group, methods: Sequence[Method]) -> dict[str, Tally]:
+        """Label -> figures over the group, for each method in the order given."""
+        wanted = {method.label: method for method in methods}
+        new = [m for label, m in wanted.items() if (group.name, label) not in self._tallies]
+        if new:
+            task = self._progress.add_task(f"{len(new)} methods on {group.name}", total=None)
+            found = {method.label: Tally() for method in new}
+            for footage in group:
+                for method in new:
+                    found[method.label].add(footage, method.predict(footage))
+                    self._progress.update(
+                        task, advance=1, description=f"{group.name}: {method.label}"
+                    )
+            self._progress.remove_task(task)
+            self._tallies |= {(group.name, label): tally for label, tally in found.items()}
+        return {label: self._tallies[group.name, label] for label in wanted}
+
+
+def step_times_ms(
+    methods: Sequence[Method], *, width: int = 640, height: int = 480, rounds: int = 5
+) -> dict[str, float]:
+    """Label -> median wall milliseconds of a frame that is not the first.
+
+    The methods take turns, so that a busy moment of the machine hits all of them.
+    """
+    footage = textured_footage(width, height, rounds + 1)
+    predictions = [(method.label, method.predict(footage)) for method in methods]
+    times: dict[str, list[float]] = {label: [] for label, _ in predictions}
+    for turn in range(rounds + 1):
+        for label, predicted in predictions:
+            start = time.perf_counter()
+            next(predicted)
+            if turn:
+                times[label].append(1e3 * (time.perf_counter() - start))
+    return {label: float(np.median(spent)) for label, spent in times.items()}
+
+
+def textured_footage(width: int, height: int, frames: int) -> Footage:
+    """A still view of noise at four scales, all at a disparity of 16 px: something to time on."""
+    random = np.random.default_rng(0)
+    wide = np.zeros((height, width + 16, 3), np.float32)
+    for scale in (2, 8, 32, 128):
+        small = random.uniform(-32, 32, (height // scale + 1, (width + 16) // scale + 1, 3))
+        wide += cv2.resize(small.astype(np.float32), wide.shape[1::-1])
+    image = (wide + 128).clip(0, 255).astype(np.uint8)
+    left, right = (np.ascontiguousarray(image[:, x : x + width]) for x in (0, 16))
+    rig = RectifiedRig(width, height, width, width, width / 2, width / 2, height / 2, 0.1)
+    return Footage("textured", rig, [View(left, right, None)] * frames)

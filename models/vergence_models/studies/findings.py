@@ -1,0 +1,82 @@
+"""What a table says of the paper's findings, in words computed from its figures."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+
+from vergence_models.studies.contenders import Contender
+from vergence_models.studies.tables import Row
+from vergence_models.tally import Tally
+
+PAPER_SETTLED = 15  # frames, at 30 Hz
+GENTLE = 1.05  # noise of one level may cost so much
+
+
+def verdict(holds: bool) -> str:
+    return "holds" if holds else "**does not hold yet**"
+
+
+def main_findings(contenders: Sequence[Contender], found: Mapping[str, Tally]) -> list[str]:
+    """One warm iteration against the same network without memory, tier by tier."""
+    lines = []
+    epes = {label: tally.summary().get("epe") for label, tally in found.items()}
+    for tier in dict.fromkeys(contender.tier for contender in contenders):
+        same = [contender for contender in contenders if contender.tier == tier]
+        warm = next((c.warm_methods()[0].label for c in same if c.warm[:1] == (1,)), None)
+        warm_epe = None if warm is None else epes.get(warm)
+        if warm_epe is None:
+            continue
+        for contender in same:
+            counts = zip(contender.single_frame, contender.single_frame_methods(), strict=True)
+            for count, method in counts:
+                alone = epes.get(method.label)
+                if alone is None:
+                    continue
+                limit = 1.05 if count >= 20 else 1.0  # of their RAFT-Stereo at 20 and at 7
+                lines.append(
+                    f"`{tier}`: one warm iteration has {warm_epe / alone:.2f} times the EPE of the "
+                    f"same network, every frame cold, with {count} iterations (the paper: at "
+                    f"most {limit:.2f}): {verdict(warm_epe <= limit * alone)}."
+                )
+    return lines
+
+
+def speed_findings(cells: Mapping[str, Mapping[str, float]]) -> list[str]:
+    """Warp loses under 20 % at six times the speed, no warp over 60 %: the paper's shape."""
+    lines = []
+    for label, values in cells.items():
+        lost = 100 * (values["6x"] / values["1x"] - 1)
+        if label.endswith("state moved by the true motion"):
+            lines.append(
+                f"{label}: {lost:+.0f} % EPE at 6x (the paper: under +20 %): {verdict(lost < 20)}."
+            )
+        elif label.endswith("state not moved"):
+            lines.append(
+                f"{label}: {lost:+.0f} % EPE at 6x (the paper: over +60 %): {verdict(lost > 60)}."
+            )
+    return lines
+
+
+def noise_findings(cells: Mapping[str, Mapping[str, float]]) -> list[str]:
+    """A monotone and gentle curve."""
+    lines = []
+    for label, values in cells.items():
+        epes = list(values.values())
+        rising = all(b >= 0.995 * a for a, b in itertools.pairwise(epes))
+        gentle = values.get("1", epes[0]) <= GENTLE * epes[0]
+        lines.append(
+            f"{label}: {100 * (values.get('1', epes[0]) / epes[0] - 1):+.1f} % EPE at level 1, "
+            f"{100 * (epes[-1] / epes[0] - 1):+.0f} % at level {list(values)[-1]}; a gentle, "
+            f"monotone curve: {verdict(rising and gentle)}."
+        )
+    return lines
+
+
+def cold_start_findings(rows: Sequence[Row]) -> list[str]:
+    return [
+        f"{row.label}: settled by frame {row.values['settled']:g} (the paper's: by frame "
+        f"{PAPER_SETTLED})."
+        for row in rows
+        if "settled" in row.values
+    ]

@@ -1,0 +1,270 @@
+"""The studies, each a question about the same networks, answered with a table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from vergence_models.evaluate import COLUMNS, figures
+from vergence_models.methods import Method, sgbm_methods, with_pose_noise, without_poses
+from vergence_models.studies import paper
+from vergence_models.studies.bench import Bench, step_times_ms
+from vergence_models.studies.contenders import Contender
+from vergence_models.studies.findings import (
+    cold_start_findings,
+    main_findings,
+    noise_findings,
+    speed_findings,
+)
+from vergence_models.studies.footage import SPEEDS, Group
+from vergence_models.studies.tables import EPE_COLUMNS, TIME_COLUMNS, Curve, Row, Table
+from vergence_models.tally import Tally, settled_frame
+
+NOISE_DEG, NOISE_M = 0.3, 0.001  # of one level
+FRAMES_TOLD = (1, 2, 3, 5, 10, 15, 20, 30)
+WARP_SPEEDS = (1, 6)
+
+Study = Callable[[Bench], Table]
+
+
+def every_method(bench: Bench) -> list[Method]:
+    """The main table's: single frame and warm at every count there is, and SGBM."""
+    methods = []
+    for contender in bench.contenders:
+        methods += contender.single_frame_methods() + contender.warm_methods()
+    return methods + sgbm_methods()
+
+
+def one_iteration(bench: Bench) -> list[tuple[Contender, Method]]:
+    """The paper's own way: one warm iteration a frame."""
+    return [
+        (contender, contender.warm_methods()[0])
+        for contender in bench.contenders
+        if contender.warm[:1] == (1,)
+    ]
+
+
+def training_of(contenders: Sequence[Contender]) -> list[str]:
+    return [contender.training.words for contender in contenders]
+
+
+def times(bench: Bench) -> Table:
+    """What a frame costs."""
+    found = step_times_ms(every_method(bench))
+    return Table(
+        name="times",
+        title="Time of a frame",
+        text="Median wall time of a 640x480 frame, batch 1, on this machine's CPU; all methods "
+        "take turns in one run. Graphs run under onnxruntime, rows that say PyTorch under PyTorch.",
+        columns=TIME_COLUMNS,
+        rows=[
+            Row(label, {"ms": round(ms, 2), "fps": round(1e3 / ms, 3)})
+            for label, ms in found.items()
+        ],
+        training=[],
+    )
+
+
+def main_table(bench: Bench) -> Table:
+    """Every method at walking pace."""
+    found = bench.tallies(bench.clips(1), every_method(bench))
+    return Table(
+        name="main",
+        title="Main table",
+        text=f"On {bench.settings.words}. EPE, TEPE (flicker along the true motion) in px; times "
+        "are of a 640x480 frame.",
+        columns=EPE_COLUMNS | {"tepe": "TEPE"} | TIME_COLUMNS,
+        rows=rows_of(found),
+        training=training_of(bench.contenders),
+        findings=main_findings(bench.contenders, found),
+        paper=paper.MAIN,
+        paper_note=paper.SOURCE,
+    )
+
+
+def warp_ablation(bench: Bench) -> Table:
+    """The same network, its state moved, left where it was, and thrown away."""
+    kinds: dict[str, Callable[[Contender, Method], Method]] = {
+        "state moved by the true motion": lambda _, warm: warm,
+        "state not moved": lambda _, warm: warm.told("state not moved", without_poses),
+        "state thrown away": lambda contender, _: contender.single_frame_methods()[-1],
+    }
+    cells: dict[str, dict[str, float]] = {}
+    for speed in WARP_SPEEDS:
+        pairs = one_iteration(bench)
+        variants = {
+            f"{contender.name}, {kind}": make(contender, warm)
+            for contender, warm in pairs
+            for kind, make in kinds.items()
+            if contender.single_frame or kind != "state thrown away"
+        }
+        found = bench.tallies(bench.clips(speed), list(variants.values()))
+        for row, method in variants.items():
+            cells.setdefault(row, {})[f"{speed}x"] = epe(found[method.label])
+    rows = [Row(label, values | {"loss": loss(values)}) for label, values in cells.items()]
+    return Table(
+        name="warp",
+        title="Warp or no warp, at 1x and 6x",
+        text=f"EPE in px on {bench.settings.words}; the same scenes and paths, played back at both "
+        "speeds, one warm iteration a frame. *Not moved*: the same weights are told that the "
+        "camera stands still, which leaves the state in place (a network without a warp shows the "
+        "same row twice). *Thrown away*: every frame cold.",
+        columns={"1x": "1x", "6x": "6x", "loss": "loss at 6x, %"},
+        rows=rows,
+        training=training_of(bench.contenders),
+        findings=speed_findings(cells),
+        paper=[Row(r.label, r.values | {"loss": loss(r.values)}) for r in paper.SPEED],
+        paper_note=paper.SOURCE,
+    )
+
+
+def loss(values: dict[str, float]) -> float:
+    return 100 * (values["6x"] / values["1x"] - 1)
+
+
+def movement_speed(bench: Bench) -> Table:
+    """From a calm head to a violent one."""
+    methods = []
+    for contender, warm in one_iteration(bench):
+        methods += [warm, warm.told("state not moved", without_poses)]
+        methods += contender.single_frame_methods()[-1:]
+    methods += sgbm_methods()[:1]
+    cells: dict[str, dict[str, float]] = {method.label: {} for method in methods}
+    for speed in SPEEDS:
+        for label, tally in bench.tallies(bench.clips(speed), methods).items():
+            cells[label][f"{speed}x"] = epe(tally)
+    return Table(
+        name="speed",
+        title="Movement speed, 1x to 20x",
+        text=f"EPE in px on {bench.settings.words}. A calm head's path (about 9 degrees and 10 cm "
+        "a second) is played back faster: the same scenes, the same path.",
+        columns={f"{speed}x": f"{speed}x" for speed in SPEEDS},
+        rows=[Row(label, values) for label, values in cells.items()],
+        training=training_of(bench.contenders),
+        paper=paper.SPEED,
+        paper_note=paper.SOURCE,
+        curves=[
+            Curve(label, [float(s) for s in SPEEDS], list(values.values()))
+            for label, values in cells.items()
+        ],
+        x_label="playback speed",
+    )
+
+
+def pose_noise(bench: Bench, levels: Sequence[int] = range(11)) -> Table:
+    """The tracker's errors, from none to far beyond any tracker."""
+    cells: dict[str, dict[str, float]] = {}
+    for _, warm in one_iteration(bench):
+        told = {level: told_noise(warm, level) for level in levels}
+        found = bench.tallies(bench.clips(1), list(told.values()))
+        cells[warm.label] = {str(k): epe(found[method.label]) for k, method in told.items()}
+    return Table(
+        name="noise",
+        title="Noise of the poses, levels 0 to 10",
+        text=f"EPE in px on {bench.settings.words}. At level k every motion from one frame to the "
+        f"next is off by k x {NOISE_DEG} degrees and k x {1e3 * NOISE_M:g} mm, in random "
+        "directions that are the same at each level.",
+        columns={str(level): str(level) for level in levels},
+        rows=[Row(label, values) for label, values in cells.items()],
+        training=training_of(bench.contenders),
+        findings=noise_findings(cells),
+        paper_note=paper.NOISE_NOTE,
+        curves=[
+            Curve(label, [float(k) for k in levels], list(values.values()))
+            for label, values in cells.items()
+        ],
+        x_label="noise level",
+    )
+
+
+def told_noise(method: Method, level: int) -> Method:
+    if level == 0:
+        return method
+    return method.told(
+        f"noise level {level}",
+        lambda footage: with_pose_noise(footage, deg=level * NOISE_DEG, m=level * NOISE_M),
+    )
+
+
+def cold_start(bench: Bench) -> Table:
+    """How long a stream takes to settle."""
+    methods = []
+    for contender, warm in one_iteration(bench):
+        methods += [warm, *contender.single_frame_methods()[-1:]]
+        if contender.cold > 1:
+            methods.append(contender.started_with(1))
+    found = bench.tallies(bench.clips(1), methods)
+    curves = {label: tally.epe_by_frame() for label, tally in found.items()}
+    told = [frame for frame in FRAMES_TOLD if frame <= bench.settings.frames]
+    rows = []
+    for label, epes in curves.items():
+        values = {str(frame): epes[frame - 1] for frame in told if frame <= len(epes)}
+        settled = settled_frame(epes)
+        rows.append(Row(label, values if settled is None else values | {"settled": settled}))
+    cold = ", ".join(f"{c.name} {c.cold}" for c, _ in one_iteration(bench))
+    return Table(
+        name="cold",
+        title="Cold start",
+        text=f"EPE in px by the number of the frame, on {bench.settings.words}. *Settled*: the "
+        "first frame within 10 % of the mean over the later half. Iterations on the first frame, "
+        f"where a row does not say: {cold}.",
+        columns={str(frame): str(frame) for frame in told} | {"settled": "settled by"},
+        rows=rows,
+        training=training_of(bench.contenders),
+        findings=cold_start_findings([row for row in rows if "every frame" not in row.label]),
+        paper=paper.COLD_START,
+        paper_note=paper.SOURCE,
+        curves=[
+            Curve(label, [float(k + 1) for k in range(len(epes))], epes)
+            for label, epes in curves.items()
+        ],
+        x_label="frame",
+    )
+
+
+def on_data(bench: Bench, group: Group, name: str) -> Table:
+    """The main table on sequences or pairs from disk."""
+    found = bench.tallies(group, every_method(bench))
+    return Table(
+        name=name,
+        title=f"On `{group.name}`",
+        text=f"At most {group.frames} frames of each sequence.",
+        columns=EPE_COLUMNS | {"tepe": "TEPE", "settled": "settled by"} | TIME_COLUMNS,
+        rows=rows_of(found),
+        training=training_of(bench.contenders),
+        findings=main_findings(bench.contenders, found),
+    )
+
+
+def kitti(bench: Bench, group: Group) -> Table:
+    """The paper's protocol for KITTI odometry: EPE, and the errors that few pixels exceed."""
+    found = bench.tallies(group, every_method(bench))
+    tail = {key: COLUMNS[key] for key in ("p99", "p97", "p95")}
+    return Table(
+        name="kitti",
+        title=f"KITTI odometry: `{group.name}`",
+        text="Bad 1, 3 and 5 % as the paper means them: the error in px that only so many of the "
+        "pixels exceed, the 99th, 97th and 95th percentile.",
+        columns={"epe": "EPE"} | tail | TIME_COLUMNS,
+        rows=rows_of(found),
+        training=training_of(bench.contenders),
+        paper=paper.KITTI,
+        paper_note=paper.SOURCE,
+    )
+
+
+def rows_of(found: dict[str, Tally]) -> list[Row]:
+    return [Row(label, figures(tally)) for label, tally in found.items()]
+
+
+def epe(tally: Tally) -> float:
+    return tally.summary()["epe"]
+
+
+STUDIES: dict[str, Study] = {
+    "main": main_table,
+    "warp": warp_ablation,
+    "speed": movement_speed,
+    "noise": pose_noise,
+    "cold": cold_start,
+    "times": times,
+}

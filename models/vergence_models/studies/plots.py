@@ -1,0 +1,83 @@
+"""Curves of the studies as PNGs, and one page of them all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vergence_models.studies.tables import Table, with_times
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+PAGE = "studies"  # file name of the page of all plots
+
+
+def drawable(tables: Sequence[Table]) -> dict[str, Table]:
+    """Name of the plot -> its table; `runtime` is the main table against its times."""
+    by_name = {table.name: table for table in tables}
+    plots = {}
+    if "main" in by_name and "times" in by_name:
+        plots["runtime"] = with_times(by_name["main"], by_name["times"])
+    plots |= {name: table for name, table in by_name.items() if table.curves}
+    return plots
+
+
+def draw(axes: Axes, name: str, table: Table) -> None:
+    if name == "runtime":
+        draw_runtime(axes, table)
+        return
+    for curve in table.curves:
+        marker = "." if len(curve.x) < 15 else ""
+        axes.plot(curve.x, curve.epe, marker=marker, label=curve.label)
+    axes.set(xlabel=table.x_label, ylabel="EPE [px]", title=table.title, ylim=(0, None))
+    axes.legend(fontsize=6)
+
+
+def draw_runtime(axes: Axes, table: Table) -> None:
+    """Each method as a point; the warm and the single-frame ones of a network in one colour."""
+    shades: Mapping[str, str] = {"full": "C0", "fast": "C1", "lite": "C2"}
+    for row in table.rows:
+        if "ms" not in row.values or "epe" not in row.values:
+            continue
+        shade = shades.get(row.label.split()[0].rstrip(","), "0.4")
+        marker = "o" if "warm" in row.label else "s"
+        axes.plot(row.values["ms"], row.values["epe"], marker, color=shade)
+        axes.annotate(
+            row.label,
+            (row.values["ms"], row.values["epe"]),
+            xytext=(4, 3),
+            textcoords="offset points",
+            fontsize=6,
+        )
+    axes.set(xscale="log", xlabel="time of a 640x480 frame [ms]", ylabel="EPE [px]")
+    axes.set(title="Runtime against error", ylim=(0, None))
+    axes.margins(x=0.3)
+
+
+def draw_plots(tables: Sequence[Table], folder: Path) -> list[str]:
+    """One PNG per study that has curves, and a page of all; returns the names of the former."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    plots = drawable(tables)
+    for name, table in plots.items():
+        figure, axes = plt.subplots(figsize=(7, 4.5), layout="constrained")
+        draw(axes, name, table)
+        figure.savefig(folder / f"{name}.png", dpi=100)
+        plt.close(figure)
+    if plots:
+        rows = (len(plots) + 1) // 2
+        figure, grid = plt.subplots(
+            rows, 2, figsize=(11, 3.9 * rows), layout="constrained", squeeze=False
+        )
+        for axes in grid.flat[len(plots) :]:
+            axes.set_axis_off()
+        for axes, (name, table) in zip(grid.flat, plots.items(), strict=False):
+            draw(axes, name, table)
+        figure.savefig(folder / f"{PAGE}.png", dpi=75)
+        plt.close(figure)
+    return list(plots)

@@ -1,0 +1,134 @@
+"""What a study leaves behind: a table, its curves, and what it says. JSON and Markdown of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+FORMAT = 1
+
+EPE_COLUMNS = {"epe": "EPE", "d1": "D1 %", "d3": "D3 %", "d5": "D5 %"}
+TIME_COLUMNS = {"ms": "ms", "fps": "FPS"}  # joined from the table of times
+
+
+class StudyFileError(ValueError):
+    """A JSON file to add to is not one of studies."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    label: str
+    values: dict[str, float]  # by the keys of the table's columns; what is unknown is left out
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """EPE in px over whatever the study varies."""
+
+    label: str
+    x: list[float]
+    epe: list[float]
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """One study. Every table carries the training state of the networks in it."""
+
+    name: str
+    title: str
+    text: str  # what was done, on what
+    columns: dict[str, str]  # key -> heading
+    rows: list[Row]
+    training: list[str]
+    findings: list[str] = field(default_factory=list)
+    paper: list[Row] = field(default_factory=list)  # theirs, on their data
+    paper_note: str = ""
+    curves: list[Curve] = field(default_factory=list)
+    x_label: str = ""
+
+    @property
+    def labels(self) -> list[str]:
+        return [row.label for row in self.rows]
+
+
+def table_from_dict(values: dict[str, Any]) -> Table:
+    """The inverse of ``dataclasses.asdict``; ``values`` is any JSON."""
+    lists = {
+        "rows": [Row(**row) for row in values["rows"]],
+        "paper": [Row(**row) for row in values["paper"]],
+        "curves": [Curve(**curve) for curve in values["curves"]],
+    }
+    return Table(**{**values, **lists})
+
+
+def read_tables(path: Path) -> dict[str, Table]:
+    """The tables of an earlier run; none if there is no such file. Raises StudyFileError."""
+    if not path.exists():
+        return {}
+    try:
+        contents = json.loads(path.read_text("utf-8"))
+        if contents["format"] != FORMAT:
+            raise StudyFileError(f"{path}: expected format {FORMAT}, got {contents['format']}")
+        return {name: table_from_dict(values) for name, values in contents["studies"].items()}
+    except (ValueError, KeyError, TypeError) as error:
+        if isinstance(error, StudyFileError):
+            raise
+        raise StudyFileError(f"{path}: expected the JSON of studies: {error!r}") from None
+
+
+def write_tables(path: Path, tables: Iterable[Table]) -> None:
+    studies = {table.name: dataclasses.asdict(table) for table in tables}
+    path.write_text(json.dumps({"format": FORMAT, "studies": studies}, indent=1) + "\n", "utf-8")
+
+
+def with_times(table: Table, times: Table | None) -> Table:
+    """The same table, its columns of time filled in from the table of times."""
+    if times is None or not set(TIME_COLUMNS) & set(table.columns):
+        return table
+    known = {row.label: row.values for row in times.rows}
+    rows = [
+        Row(
+            row.label,
+            row.values | {k: v for k, v in known.get(row.label, {}).items() if k in TIME_COLUMNS},
+        )
+        for row in table.rows
+    ]
+    return dataclasses.replace(table, rows=rows)
+
+
+def markdown(tables: Sequence[Table], missing: Sequence[str], plots: Iterable[str]) -> str:
+    """The report. ``missing`` tiers are named; ``plots`` are the names of those drawn."""
+    times = next((table for table in tables if table.name == "times"), None)
+    drawn = set(plots)
+    parts = ["# Studies"]
+    if missing:
+        names = ", ".join(f"`{name}`" for name in missing)
+        parts.append(f"Without weights, and so left out of every table: {names}.")
+    for table in tables:
+        parts.append(_section(with_times(table, times)))
+        if table.name in drawn:
+            parts.append(f"![{table.title}]({table.name}.png)")
+    return "\n\n".join(parts) + "\n"
+
+
+def _section(table: Table) -> str:
+    lines = [f"## {table.title}", "", table.text, ""]
+    lines.append("| | " + " | ".join(table.columns.values()) + " |")
+    lines.append("|---|" + "---:|" * len(table.columns))
+    lines += [_line(row.label, row, table) for row in table.rows]
+    lines += [_line(f"*theirs, on their data:* {row.label}", row, table) for row in table.paper]
+    lines += [""] + [f"- {finding}" for finding in table.findings]
+    if table.training:
+        lines += ["", "Trained so far: " + "; ".join(table.training) + "."]
+    if table.paper_note:
+        lines += ["", table.paper_note]
+    return "\n".join(lines)
+
+
+def _line(label: str, row: Row, table: Table) -> str:
+    cells = [f"{row.values[key]:.3g}" if key in row.values else "" for key in table.columns]
+    return f"| {label} | " + " | ".join(cells) + " |"

@@ -1,0 +1,49 @@
+"""A training run stepped over footage, where no graph of it was exported."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from vergence_models.runs import Run
+from vergence_models.stepping import Image, Plane, State, SteppedNetwork
+from vergence_models.tiers import build_network
+from vergence_proto.model_io import ModelCard
+
+
+class TorchNetwork(SteppedNetwork):
+    """The averaged weights of a run, computed by PyTorch on the CPU: any iteration count."""
+
+    def __init__(self, run: Run, *, threads: int = 2) -> None:
+        torch.set_num_threads(threads)
+        self._network = build_network(run.network).eval()
+        self._network.load_state_dict(run.weights)
+        self.card = ModelCard(
+            name=run.config_name,
+            stride=run.network.stride,
+            max_disparity_px=run.network.max_disparity_px,
+            state=self._network.state_tensors,
+            graphs={},
+            weights_sha256="",
+        )
+
+    @torch.inference_mode()
+    def run(
+        self,
+        left: Image,
+        right: Image,
+        uvd_curr_from_prev: NDArray[np.float32],
+        state: State,
+        iterations: int,
+    ) -> tuple[Plane, Plane, State]:
+        images = (torch.from_numpy(np.ascontiguousarray(image)) for image in (left, right))
+        tensors = tuple(torch.from_numpy(array) for array in state)
+        estimate, following = self._network(
+            *images, torch.from_numpy(uvd_curr_from_prev), tensors, iterations
+        )
+        return (
+            estimate.disparity.numpy(),
+            estimate.sigma.numpy(),
+            tuple(tensor.numpy() for tensor in following),
+        )
