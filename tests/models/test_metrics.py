@@ -15,6 +15,7 @@ from vergence_models.export import shifted_pair
 from vergence_models.metrics import calibration, error_measures, temporal_error
 from vergence_models.sgbm import filled, sgbm_disparity
 from vergence_models.stepping import footage_from_clip
+from vergence_models.tally import settled_frame
 from vergence_proto.geometry import Pose
 
 
@@ -30,6 +31,24 @@ def test_measures_of_known_errors() -> None:
     assert found["d1"] == found["bad2"] == pytest.approx(100 / 9)
     assert found["d3"] == 0
     assert found["p95"] == pytest.approx(2.5)
+
+
+def test_bad_percents_are_the_percentiles_of_numpy() -> None:
+    random = np.random.default_rng(0)
+    truth = random.uniform(1, 60, (40, 50)).astype(np.float32)
+    predicted = (truth + random.standard_cauchy(truth.shape)).astype(np.float32)
+    truth[random.random(truth.shape) < 0.2] = np.nan
+    found = error_measures(predicted, truth)
+    assert found is not None
+    error = np.abs(predicted - truth)[np.isfinite(truth)]
+    for rank in (95, 97, 99):
+        assert found[f"p{rank}"] == pytest.approx(np.percentile(error, rank))
+
+
+def test_a_start_has_settled_once_it_is_within_ten_percent_of_the_later_mean() -> None:
+    assert settled_frame([3.0, 1.2, 1.05, 1.0, 1.0, 1.0]) == 3
+    assert settled_frame([1.0, 1.0, 1.0, 1.0]) == 1
+    assert settled_frame([1.0, 2.0, 3.0]) is None
 
 
 def test_hardly_any_truth_is_no_measure() -> None:
@@ -82,13 +101,16 @@ def test_the_command_tells_of_every_method(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_shard(tmp_path / "pool" / "shard_1_000000", wall_clips(1, height=192, width=256))
-    main(["--pool", str(tmp_path / "pool"), "--json", str(tmp_path / "out.json"), "--thorough"])
+    pool, out, plots = (str(tmp_path / name) for name in ("pool", "out.json", "plots"))
+    main(["--pool", pool, "--json", out, "--plots", plots, "--thorough"])
     assert "SGBM, half size" in capsys.readouterr().out
     written = json.loads((tmp_path / "out.json").read_text())["pool pool"]
     assert len(written) == 6
     for measures in written.values():
         assert len(measures["epe_by_frame"]) == 3
         assert measures["tepe"] >= 0
+    assert "### pool pool" in (tmp_path / "out.md").read_text()
+    assert (tmp_path / "plots" / "pool_pool.png").stat().st_size > 1000
 
 
 def test_nothing_to_evaluate_on_is_said(capsys: pytest.CaptureFixture[str]) -> None:

@@ -22,6 +22,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn
 
+from vergence_models.config import ConfigError
 from vergence_models.evaluate import WEIGHTS
 from vergence_models.runs import RunError
 from vergence_models.studies.bench import Bench
@@ -113,7 +114,14 @@ def main(arguments: list[str] | None = None) -> None:
                 log.info("study: %s", name)
                 tables[name] = study(bench)
                 report(tables, missing, given.json)
-    except (ManifestError, RunError, LayoutError, StudyFileError, FileNotFoundError) as error:
+    except (
+        ConfigError,
+        FileNotFoundError,
+        LayoutError,
+        ManifestError,
+        RunError,
+        StudyFileError,
+    ) as error:
         sys.exit(f"vergence_models.studies: {error}")
     sys.stdout.write(given.json.with_suffix(".md").read_text("utf-8"))
 

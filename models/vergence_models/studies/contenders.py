@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from vergence_models.methods import Method, single_frame_method, warm_method
-from vergence_models.runs import read_run
+from vergence_models.runs import Run, read_run
 from vergence_models.stepping import OnnxNetwork, SteppedNetwork
 from vergence_models.torch_stepping import TorchNetwork
 from vergence_proto.model_io import MANIFEST_NAME, ManifestError
@@ -102,9 +102,8 @@ def exported(folder: Path, *, threads: int) -> list[Contender]:
     return found
 
 
-def trained(folder: Path, beside: Iterable[Contender], *, threads: int) -> Contender:
-    """A training run, for the counts that no exported graph of its name has. Raises RunError."""
-    run = read_run(folder)
+def trained(run: Run, beside: Iterable[Contender], *, threads: int) -> Contender:
+    """A training run, for the counts that no exported graph of its name has."""
     tier = run.config_name
     same = [other for other in beside if other.tier == tier]
     name = f"{tier} (PyTorch)"
@@ -121,13 +120,17 @@ def trained(folder: Path, beside: Iterable[Contender], *, threads: int) -> Conte
 
 
 def gather_contenders(weights: list[Path], runs: list[Path], *, threads: int) -> list[Contender]:
-    """All of them, ordered by tier; a model in two folders is taken from the first."""
+    """All of them, ordered by tier; a model in two folders is taken from the first.
+
+    Raises ManifestError, RunError, ConfigError.
+    """
     found: dict[str, Contender] = {}
+    read = [read_run(folder) for folder in runs]  # quick to fail, graphs are slow to load
     for folder in weights:
         for contender in exported(folder, threads=threads):
             found.setdefault(contender.name, contender)
-    for folder in runs:
-        contender = trained(folder, list(found.values()), threads=threads)
+    for run in read:
+        contender = trained(run, list(found.values()), threads=threads)
         found.setdefault(contender.name, contender)
     order = {name: place for place, name in enumerate(TIERS)}
     return sorted(found.values(), key=lambda c: (order.get(c.tier, len(order)), c.name))

@@ -135,7 +135,7 @@ def movement_speed(bench: Bench) -> Table:
     return Table(
         name="speed",
         title="Movement speed, 1x to 20x",
-        text=f"EPE in px on {bench.settings.words}. A calm head's path (about 9 degrees and 10 cm "
+        text=f"EPE in px on {bench.settings.words}. A calm head's path (about 10 degrees and 10 cm "
         "a second) is played back faster: the same scenes, the same path.",
         columns={f"{speed}x": f"{speed}x" for speed in SPEEDS},
         rows=[Row(label, values) for label, values in cells.items()],

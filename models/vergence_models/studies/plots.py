@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 PAGE = "studies"  # file name of the page of all plots
+SHADES = {"full": "C0", "fast": "C1", "lite": "C2"}
 
 
 def drawable(tables: Sequence[Table]) -> dict[str, Table]:
@@ -28,32 +29,36 @@ def draw(axes: Axes, name: str, table: Table) -> None:
     if name == "runtime":
         draw_runtime(axes, table)
         return
+    highest = max(max(curve.epe) for curve in table.curves)
     for curve in table.curves:
         marker = "." if len(curve.x) < 15 else ""
         axes.plot(curve.x, curve.epe, marker=marker, label=curve.label)
-    axes.set(xlabel=table.x_label, ylabel="EPE [px]", title=table.title, ylim=(0, None))
-    axes.legend(fontsize=6)
+    axes.set(xlabel=table.x_label, ylabel="EPE [px]", title=table.title)
+    axes.set_ylim(0, 1.1 * highest)
+    axes.legend(fontsize=6, loc="lower right")
 
 
 def draw_runtime(axes: Axes, table: Table) -> None:
-    """Each method as a point; the warm and the single-frame ones of a network in one colour."""
-    shades: Mapping[str, str] = {"full": "C0", "fast": "C1", "lite": "C2"}
+    """Each method as a point: circles remember, squares do not; one colour for a network."""
     for row in table.rows:
         if "ms" not in row.values or "epe" not in row.values:
             continue
-        shade = shades.get(row.label.split()[0].rstrip(","), "0.4")
+        shade = SHADES.get(row.label.split()[0].rstrip(","), "0.4")
         marker = "o" if "warm" in row.label else "s"
         axes.plot(row.values["ms"], row.values["epe"], marker, color=shade)
+        # Close neighbours write one above and one below.
+        above = sum(ord(letter) for letter in row.label) % 2 == 0
         axes.annotate(
-            row.label,
+            row.label.replace(" iterations", "").replace(" iteration", ""),
             (row.values["ms"], row.values["epe"]),
-            xytext=(4, 3),
+            xytext=(3, 4 if above else -9),
             textcoords="offset points",
             fontsize=6,
         )
     axes.set(xscale="log", xlabel="time of a 640x480 frame [ms]", ylabel="EPE [px]")
-    axes.set(title="Runtime against error", ylim=(0, None))
-    axes.margins(x=0.3)
+    axes.set(title="Runtime against error")
+    axes.margins(x=0.4, y=0.2)
+    axes.set_ylim(bottom=0)
 
 
 def draw_plots(tables: Sequence[Table], folder: Path) -> list[str]:

@@ -116,12 +116,15 @@ def markdown(tables: Sequence[Table], missing: Sequence[str], plots: Iterable[st
 
 
 def _section(table: Table) -> str:
-    lines = [f"## {table.title}", "", table.text, ""]
-    lines.append("| | " + " | ".join(table.columns.values()) + " |")
-    lines.append("|---|" + "---:|" * len(table.columns))
-    lines += [_line(row.label, row, table) for row in table.rows]
-    lines += [_line(f"*theirs, on their data:* {row.label}", row, table) for row in table.paper]
-    lines += [""] + [f"- {finding}" for finding in table.findings]
+    known = set[str]().union(*(row.values for row in table.rows))
+    columns = [key for key in table.columns if key in known]
+    headings = " | ".join(table.columns[key] for key in columns)
+    lines = [f"## {table.title}", "", table.text, "", f"| | {headings} |"]
+    lines.append("|---|" + "---:|" * len(columns))
+    lines += [_line(row.label, row, columns) for row in table.rows]
+    lines += [_line(f"*theirs, on their data:* {row.label}", row, columns) for row in table.paper]
+    if table.findings:
+        lines += ["", *(f"- {finding}" for finding in table.findings)]
     if table.training:
         lines += ["", "Trained so far: " + "; ".join(table.training) + "."]
     if table.paper_note:
@@ -129,6 +132,6 @@ def _section(table: Table) -> str:
     return "\n".join(lines)
 
 
-def _line(label: str, row: Row, table: Table) -> str:
-    cells = [f"{row.values[key]:.3g}" if key in row.values else "" for key in table.columns]
+def _line(label: str, row: Row, columns: Sequence[str]) -> str:
+    cells = [f"{row.values[key]:.3g}" if key in row.values else "" for key in columns]
     return f"| {label} | " + " | ".join(cells) + " |"
