@@ -29,7 +29,7 @@ from vergence_models.studies.contenders import (
     gather_contenders,
     missing_tiers,
 )
-from vergence_models.studies.footage import SPEEDS, ClipSettings
+from vergence_models.studies.footage import SPEEDS, StudySettings
 from vergence_models.studies.plan import (
     STUDIES,
     cold_start,
@@ -42,7 +42,7 @@ from vergence_models.studies.plan import (
 from vergence_models.studies.tables import Table, markdown, read_tables, write_tables
 
 RUN = Path(__file__).parents[2] / "models" / "runs" / "lite"
-TINY = ClipSettings(clips=1, frames=4, width=192, height=64)
+TINY = StudySettings(clips=1, frames=4, short=4, width=192, height=64)
 
 
 @pytest.fixture(scope="module")
@@ -204,7 +204,19 @@ def test_the_command_writes_what_it_ran_and_keeps_the_rest(
     path = tmp_path / "out" / "studies.json"
     path.parent.mkdir()
     write_tables(path, [tables["main"], tables["speed"]])
-    main(["--json", str(path), "--studies", "times", "--cache", str(cache), "--threads", "1"])
+    main(
+        [
+            "--json",
+            str(path),
+            "--studies",
+            "times",
+            "--quick",
+            "--cache",
+            str(cache),
+            "--threads",
+            "1",
+        ]
+    )
     kept = read_tables(path)
     assert set(kept) == {"main", "speed", "times"}
     assert kept["times"].labels == kept["main"].labels

@@ -30,8 +30,8 @@ class Playback:
     """A calm head's motion, played back faster: one scene and one path, whatever the speed."""
 
     speed: float = 1.0
-    # The scene leaves room for the path of a clip at this speed: the same room at every lower one.
-    fastest: float = 20.0
+    # So long a path the scene leaves room for: it is the same one for every clip within it.
+    path_s: float = 20.0
 
 
 def draw_shot(
@@ -56,8 +56,7 @@ def draw_shot(
     else:
         motion = HeadMotion.draw(rng, speed=1.0)
         start_from_left = _poses(motion, times_s * playback.speed)
-        path_s = times_s[-1] * playback.fastest
-        reach = _poses(motion, np.linspace(0, path_s, 1 + round(path_s * rate_hz)))
+        reach = _poses(motion, np.arange(0, playback.path_s, 1 / rate_hz))
     travel_m = float(np.linalg.norm(reach[:, :3, 3], axis=1).max())
     turn = np.arccos(np.clip(reach[:, 2, 2], -1, 1)).max()
 

@@ -27,7 +27,7 @@ from vergence_models.evaluate import WEIGHTS
 from vergence_models.runs import RunError
 from vergence_models.studies.bench import Bench
 from vergence_models.studies.contenders import gather_contenders, missing_tiers
-from vergence_models.studies.footage import ClipSettings, group_on_disk
+from vergence_models.studies.footage import StudySettings, group_on_disk
 from vergence_models.studies.plan import STUDIES, Study, kitti, on_data
 from vergence_models.studies.plots import draw_plots
 from vergence_models.studies.tables import (
@@ -41,11 +41,11 @@ from vergence_proto.layouts import LayoutError
 from vergence_proto.model_io import ManifestError
 
 log = logging.getLogger("vergence_models.studies")
-QUICK = ClipSettings(clips=2, frames=8)
+QUICK = StudySettings(clips=2, frames=8, short=4, timed=2)
 
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:
-    usual = ClipSettings()
+    usual = StudySettings()
     parser = argparse.ArgumentParser(
         prog="vergence_models.studies",
         description=__doc__,
@@ -94,7 +94,12 @@ def main(arguments: list[str] | None = None) -> None:
     settings = (
         QUICK
         if given.quick
-        else ClipSettings(clips=given.clips, frames=given.frames, textures=given.textures)
+        else StudySettings(
+            clips=given.clips,
+            frames=given.frames,
+            short=min(given.frames, StudySettings().short),
+            textures=given.textures,
+        )
     )
     given.json.parent.mkdir(parents=True, exist_ok=True)
     columns = (SpinnerColumn(), *Progress.get_default_columns()[:1], TimeElapsedColumn())

@@ -13,7 +13,7 @@ from rich.progress import Progress
 from vergence_models.methods import Method
 from vergence_models.stepping import Footage, View
 from vergence_models.studies.contenders import Contender
-from vergence_models.studies.footage import ClipSettings, Group, clips_at
+from vergence_models.studies.footage import Group, StudySettings, clips_at
 from vergence_models.tally import Tally
 from vergence_proto.geometry import RectifiedRig
 
@@ -25,7 +25,7 @@ class Bench:
         self,
         contenders: Sequence[Contender],
         *,
-        settings: ClipSettings,
+        settings: StudySettings,
         cache: Path,
         workers: int,
         progress: Progress,
@@ -35,16 +35,25 @@ class Bench:
         self._cache = cache
         self._workers = workers
         self._progress = progress
-        self._clips: dict[int, Group] = {}
+        self._clips: dict[tuple[int, int], Group] = {}
         self._tallies: dict[tuple[str, str], Tally] = {}
 
-    def clips(self, speed: int) -> Group:
-        """The held-out clips at one speed, rendered if need be."""
-        if speed not in self._clips:
+    def clips(self) -> Group:
+        """The held-out clips as they were filmed, whole."""
+        return self._group(1, self.settings.frames)
+
+    def short_clips(self, speed: int) -> Group:
+        """The first frames of the held-out clips, played back at a speed."""
+        return self._group(speed, self.settings.short)
+
+    def _group(self, speed: int, frames: int) -> Group:
+        if (speed, frames) not in self._clips:
             self._progress.stop()  # rendering shows its own
-            self._clips[speed] = clips_at(speed, self.settings, self._cache, workers=self._workers)
+            self._clips[speed, frames] = clips_at(
+                speed, self.settings, self._cache, frames=frames, workers=self._workers
+            )
             self._progress.start()
-        return self._clips[speed]
+        return self._clips[speed, frames]
 
     def tallies(self, group: Group, methods: Sequence[Method]) -> dict[str, Tally]:
         """Label -> figures over the group, for each method in the order given."""
@@ -65,7 +74,7 @@ class Bench:
 
 
 def step_times_ms(
-    methods: Sequence[Method], *, width: int = 640, height: int = 480, rounds: int = 5
+    methods: Sequence[Method], *, rounds: int, width: int = 640, height: int = 480
 ) -> dict[str, float]:
     """Label -> median wall milliseconds of a frame that is not the first.
 

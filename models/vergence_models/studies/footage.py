@@ -25,8 +25,9 @@ class Group:
     """Sequences that are judged together; read anew each time, never all in memory."""
 
     name: str
-    read: Callable[[], Iterable[Footage]]
+    words: str  # for a reader of the tables
     frames: int  # at most so many of each sequence
+    read: Callable[[], Iterable[Footage]]
 
     def __iter__(self) -> Iterator[Footage]:
         for footage in self.read():
@@ -34,39 +35,44 @@ class Group:
 
 
 @dataclass(frozen=True, slots=True)
-class ClipSettings:
-    """How many held-out clips, and of what size."""
+class StudySettings:
+    """How many held-out clips, and of what size; how long to measure times."""
 
     clips: int = 12
     frames: int = 30  # one second of a headset's camera
+    short: int = 12  # of clips that only a change of speed or of poses is studied on
     width: int = 320
     height: int = 256
     textures: Path | None = None  # a folder of photographs; None: procedural textures only
-
-    @property
-    def words(self) -> str:
-        return (
-            f"{self.clips} held-out clips of {self.frames} frames, {self.width}x{self.height}, "
-            f"from our generator (seed {SEED})"
-        )
+    timed: int = 5  # frames of each method
 
 
-def clips_at(speed: int, settings: ClipSettings, cache: Path, *, workers: int) -> Group:
-    """The scenes at one speed; renders what the cache lacks, one shard per clip."""
+def clips_at(
+    speed: int, settings: StudySettings, cache: Path, *, frames: int, workers: int
+) -> Group:
+    """The first frames of the scenes at one speed; renders what the cache lacks, clip by clip."""
     s = settings
+    rendered = s.frames if speed == 1 else s.short
     looks = f"_{s.textures.name}" if s.textures else ""
-    folder = cache / f"{s.width}x{s.height}x{s.frames}{looks}" / f"speed_{speed}"
+    folder = cache / f"{s.width}x{s.height}{looks}" / f"speed_{speed}_frames_{rendered}"
     config = GeneratorConfig(
         width=s.width,
         height=s.height,
-        frames=s.frames,
+        frames=rendered,
         playback=Playback(speed),
         textures=s.textures,
     )
     render_pool(folder, config, clips=s.clips, seed=SEED, shard_clips=1, workers=workers)
-    return Group(f"{speed}x", lambda: footage_of_pool(folder, s.clips), s.frames)
+    return Group(
+        f"{speed}x, {frames} frames",
+        f"{s.clips} held-out clips of {frames} frames, {s.width}x{s.height}, from our generator "
+        f"(seed {SEED})",
+        frames,
+        lambda: footage_of_pool(folder, s.clips),
+    )
 
 
 def group_on_disk(spec: str, frames: int) -> Group:
     """Every source under KIND:PATH. Raises LayoutError as it is read."""
-    return Group(spec, lambda: footage_on_disk([spec]), frames)
+    words = f"at most {frames} frames of each sequence in `{spec}`"
+    return Group(spec, words, frames, lambda: footage_on_disk([spec]))

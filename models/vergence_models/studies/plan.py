@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from vergence_models.evaluate import COLUMNS, figures
-from vergence_models.methods import Method, sgbm_methods, with_pose_noise, without_poses
+from vergence_models.methods import Method, counted, sgbm_methods, with_pose_noise, without_poses
 from vergence_models.studies import paper
 from vergence_models.studies.bench import Bench, step_times_ms
 from vergence_models.studies.contenders import Contender
 from vergence_models.studies.findings import (
     cold_start_findings,
+    loss_pct,
     main_findings,
     noise_findings,
-    speed_findings,
+    warp_findings,
 )
 from vergence_models.studies.footage import SPEEDS, Group
 from vergence_models.studies.tables import EPE_COLUMNS, TIME_COLUMNS, Curve, Row, Table
@@ -49,7 +50,7 @@ def training_of(contenders: Sequence[Contender]) -> list[str]:
 
 def times(bench: Bench) -> Table:
     """What a frame costs."""
-    found = step_times_ms(every_method(bench))
+    found = step_times_ms(every_method(bench), rounds=bench.settings.timed)
     return Table(
         name="times",
         title="Time of a frame",
@@ -66,12 +67,13 @@ def times(bench: Bench) -> Table:
 
 def main_table(bench: Bench) -> Table:
     """Every method at walking pace."""
-    found = bench.tallies(bench.clips(1), every_method(bench))
+    group = bench.clips()
+    found = bench.tallies(group, every_method(bench))
     return Table(
         name="main",
         title="Main table",
-        text=f"On {bench.settings.words}. EPE, TEPE (flicker along the true motion) in px; times "
-        "are of a 640x480 frame.",
+        text=f"On {group.words}. EPE and TEPE (flicker along the true motion) in px; times are of "
+        "a 640x480 frame.",
         columns=EPE_COLUMNS | {"tepe": "TEPE"} | TIME_COLUMNS,
         rows=rows_of(found),
         training=training_of(bench.contenders),
@@ -83,60 +85,54 @@ def main_table(bench: Bench) -> Table:
 
 def warp_ablation(bench: Bench) -> Table:
     """The same network, its state moved, left where it was, and thrown away."""
-    kinds: dict[str, Callable[[Contender, Method], Method]] = {
-        "state moved by the true motion": lambda _, warm: warm,
-        "state not moved": lambda _, warm: warm.told("state not moved", without_poses),
-        "state thrown away": lambda contender, _: contender.single_frame_methods()[-1],
-    }
-    cells: dict[str, dict[str, float]] = {}
+    variants: dict[str, Method] = {}
+    for contender, warm in one_iteration(bench):
+        variants[f"{contender.name}, state moved"] = warm
+        variants[f"{contender.name}, state not moved"] = not_moved(warm)
+        for count, method in zip(
+            contender.single_frame[-1:], contender.single_frame_methods()[-1:], strict=True
+        ):
+            variants[f"{contender.name}, no state, {counted(count)}"] = method
+    cells: dict[str, dict[str, float]] = {label: {} for label in variants}
     for speed in WARP_SPEEDS:
-        pairs = one_iteration(bench)
-        variants = {
-            f"{contender.name}, {kind}": make(contender, warm)
-            for contender, warm in pairs
-            for kind, make in kinds.items()
-            if contender.single_frame or kind != "state thrown away"
-        }
-        found = bench.tallies(bench.clips(speed), list(variants.values()))
-        for row, method in variants.items():
-            cells.setdefault(row, {})[f"{speed}x"] = epe(found[method.label])
-    rows = [Row(label, values | {"loss": loss(values)}) for label, values in cells.items()]
+        found = bench.tallies(bench.short_clips(speed), list(variants.values()))
+        for label, method in variants.items():
+            cells[label][f"{speed}x"] = epe(found[method.label])
     return Table(
         name="warp",
         title="Warp or no warp, at 1x and 6x",
-        text=f"EPE in px on {bench.settings.words}; the same scenes and paths, played back at both "
-        "speeds, one warm iteration a frame. *Not moved*: the same weights are told that the "
+        text=f"EPE in px on {bench.short_clips(1).words}, the same scenes and paths at both "
+        "speeds; one warm iteration a frame. *Not moved*: the same weights are told that the "
         "camera stands still, which leaves the state in place (a network without a warp shows the "
-        "same row twice). *Thrown away*: every frame cold.",
+        "same row twice). *No state*: every frame cold.",
         columns={"1x": "1x", "6x": "6x", "loss": "loss at 6x, %"},
-        rows=rows,
+        rows=[Row(label, values | {"loss": loss_pct(values)}) for label, values in cells.items()],
         training=training_of(bench.contenders),
-        findings=speed_findings(cells),
-        paper=[Row(r.label, r.values | {"loss": loss(r.values)}) for r in paper.SPEED],
+        findings=warp_findings(cells),
+        paper=[Row(row.label, row.values | {"loss": loss_pct(row.values)}) for row in paper.SPEED],
         paper_note=paper.SOURCE,
     )
 
 
-def loss(values: dict[str, float]) -> float:
-    return 100 * (values["6x"] / values["1x"] - 1)
+def not_moved(method: Method) -> Method:
+    return method.told("state not moved", without_poses)
 
 
 def movement_speed(bench: Bench) -> Table:
     """From a calm head to a violent one."""
     methods = []
-    for contender, warm in one_iteration(bench):
-        methods += [warm, warm.told("state not moved", without_poses)]
-        methods += contender.single_frame_methods()[-1:]
+    for _, warm in one_iteration(bench):
+        methods += [warm, not_moved(warm)]
     methods += sgbm_methods()[:1]
     cells: dict[str, dict[str, float]] = {method.label: {} for method in methods}
     for speed in SPEEDS:
-        for label, tally in bench.tallies(bench.clips(speed), methods).items():
+        for label, tally in bench.tallies(bench.short_clips(speed), methods).items():
             cells[label][f"{speed}x"] = epe(tally)
     return Table(
         name="speed",
         title="Movement speed, 1x to 20x",
-        text=f"EPE in px on {bench.settings.words}. A calm head's path (about 10 degrees and 10 cm "
-        "a second) is played back faster: the same scenes, the same path.",
+        text=f"EPE in px on {bench.short_clips(1).words}. A calm head's path (about 10 degrees "
+        "and 10 cm a second) is played back faster: the same scenes, the same path.",
         columns={f"{speed}x": f"{speed}x" for speed in SPEEDS},
         rows=[Row(label, values) for label, values in cells.items()],
         training=training_of(bench.contenders),
@@ -155,13 +151,13 @@ def pose_noise(bench: Bench, levels: Sequence[int] = range(11)) -> Table:
     cells: dict[str, dict[str, float]] = {}
     for _, warm in one_iteration(bench):
         told = {level: told_noise(warm, level) for level in levels}
-        found = bench.tallies(bench.clips(1), list(told.values()))
+        found = bench.tallies(bench.short_clips(1), list(told.values()))
         cells[warm.label] = {str(k): epe(found[method.label]) for k, method in told.items()}
     return Table(
         name="noise",
         title="Noise of the poses, levels 0 to 10",
-        text=f"EPE in px on {bench.settings.words}. At level k every motion from one frame to the "
-        f"next is off by k x {NOISE_DEG} degrees and k x {1e3 * NOISE_M:g} mm, in random "
+        text=f"EPE in px on {bench.short_clips(1).words}. At level k every motion from one frame "
+        f"to the next is off by k x {NOISE_DEG} degrees and k x {1e3 * NOISE_M:g} mm, in random "
         "directions that are the same at each level.",
         columns={str(level): str(level) for level in levels},
         rows=[Row(label, values) for label, values in cells.items()],
@@ -192,9 +188,10 @@ def cold_start(bench: Bench) -> Table:
         methods += [warm, *contender.single_frame_methods()[-1:]]
         if contender.cold > 1:
             methods.append(contender.started_with(1))
-    found = bench.tallies(bench.clips(1), methods)
+    group = bench.clips()
+    found = bench.tallies(group, methods)
     curves = {label: tally.epe_by_frame() for label, tally in found.items()}
-    told = [frame for frame in FRAMES_TOLD if frame <= bench.settings.frames]
+    told = [frame for frame in FRAMES_TOLD if frame <= group.frames]
     rows = []
     for label, epes in curves.items():
         values = {str(frame): epes[frame - 1] for frame in told if frame <= len(epes)}
@@ -204,9 +201,9 @@ def cold_start(bench: Bench) -> Table:
     return Table(
         name="cold",
         title="Cold start",
-        text=f"EPE in px by the number of the frame, on {bench.settings.words}. *Settled*: the "
-        "first frame within 10 % of the mean over the later half. Iterations on the first frame, "
-        f"where a row does not say: {cold}.",
+        text=f"EPE in px by the number of the frame, on {group.words}. *Settled*: the first frame "
+        "within 10 % of the mean over the later half. Iterations on the first frame, where a row "
+        f"does not say: {cold}.",
         columns={str(frame): str(frame) for frame in told} | {"settled": "settled by"},
         rows=rows,
         training=training_of(bench.contenders),
@@ -227,7 +224,7 @@ def on_data(bench: Bench, group: Group, name: str) -> Table:
     return Table(
         name=name,
         title=f"On `{group.name}`",
-        text=f"At most {group.frames} frames of each sequence.",
+        text=f"On {group.words}.",
         columns=EPE_COLUMNS | {"tepe": "TEPE", "settled": "settled by"} | TIME_COLUMNS,
         rows=rows_of(found),
         training=training_of(bench.contenders),
@@ -242,8 +239,8 @@ def kitti(bench: Bench, group: Group) -> Table:
     return Table(
         name="kitti",
         title=f"KITTI odometry: `{group.name}`",
-        text="Bad 1, 3 and 5 % as the paper means them: the error in px that only so many of the "
-        "pixels exceed, the 99th, 97th and 95th percentile.",
+        text=f"On {group.words}. Bad 1, 3 and 5 % as the paper means them: the error in px that "
+        "only so many of the pixels exceed, the 99th, 97th and 95th percentile.",
         columns={"epe": "EPE"} | tail | TIME_COLUMNS,
         rows=rows_of(found),
         training=training_of(bench.contenders),
