@@ -199,7 +199,7 @@ def test_tables_survive_their_file(tables: dict[str, Table], tmp_path: Path) -> 
 
 
 def test_the_command_writes_what_it_ran_and_keeps_the_rest(
-    tables: dict[str, Table], cache: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tables: dict[str, Table], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "out" / "studies.json"
     path.parent.mkdir()
