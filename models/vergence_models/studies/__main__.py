@@ -70,10 +70,10 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 
 def chosen(given: argparse.Namespace, frames: int) -> dict[str, Study]:
     """Name -> study, sources on disk included."""
-    extra: dict[str, Study] = {
-        name: partial(on_data, group=group_on_disk(spec, frames), name=name)
-        for name, spec in ((f"data_{Path(spec).stem}", spec) for spec in given.data)
-    }
+    extra: dict[str, Study] = {}
+    for spec in given.data:
+        name = f"data_{Path(spec.partition('?')[0]).stem}"
+        extra[name] = partial(on_data, group=group_on_disk(spec, frames), name=name)
     if given.kitti:
         extra["kitti"] = partial(kitti, group=group_on_disk(given.kitti, frames))
     return {name: STUDIES[name] for name in given.studies or STUDIES} | extra

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -59,6 +60,7 @@ class Contender:
     warm: tuple[int, ...]
     single_frame: tuple[int, ...]
     cold: int  # iterations on the first frame of a warm sequence
+    warps: bool  # its state moves with the camera; otherwise poses do not matter to it
 
     @property
     def tier(self) -> str:
@@ -97,6 +99,7 @@ def exported(folder: Path, *, threads: int) -> list[Contender]:
                 warm=tuple(n for n in WARM if n in counts),
                 single_frame=tuple(n for n in SINGLE_FRAME if n in counts) or (max(counts),),
                 cold=network.card.iterations_at_most(COLD),
+                warps=entry.get("architecture", {}).get("warp", True),
             )
         )
     return found
@@ -116,6 +119,7 @@ def trained(run: Run, beside: Iterable[Contender], *, threads: int) -> Contender
             n for n in SINGLE_FRAME if all(n not in other.single_frame for other in same)
         ),
         cold=COLD,
+        warps=dataclasses.asdict(run.network).get("warp", True),
     )
 
 

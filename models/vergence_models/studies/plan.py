@@ -87,8 +87,9 @@ def warp_ablation(bench: Bench) -> Table:
     """The same network, its state moved, left where it was, and thrown away."""
     variants: dict[str, Method] = {}
     for contender, warm in one_iteration(bench):
-        variants[f"{contender.name}, state moved"] = warm
-        variants[f"{contender.name}, state not moved"] = not_moved(warm)
+        if contender.warps:
+            variants[f"{contender.name}, state moved"] = warm
+        variants[f"{contender.name}, state not moved"] = not_moved(contender, warm)
         for count, method in zip(
             contender.single_frame[-1:], contender.single_frame_methods()[-1:], strict=True
         ):
@@ -103,8 +104,7 @@ def warp_ablation(bench: Bench) -> Table:
         title="Warp or no warp, at 1x and 6x",
         text=f"EPE in px on {bench.short_clips(1).words}, the same scenes and paths at both "
         "speeds; one warm iteration a frame. *Not moved*: the same weights are told that the "
-        "camera stands still, which leaves the state in place (a network without a warp shows the "
-        "same row twice). *No state*: every frame cold.",
+        "camera stands still, which leaves the state in place. *No state*: every frame cold.",
         columns={"1x": "1x", "6x": "6x", "loss": "loss at 6x, %"},
         rows=[Row(label, values | {"loss": loss_pct(values)}) for label, values in cells.items()],
         training=training_of(bench.contenders),
@@ -114,17 +114,18 @@ def warp_ablation(bench: Bench) -> Table:
     )
 
 
-def not_moved(method: Method) -> Method:
-    return method.told("state not moved", without_poses)
+def not_moved(contender: Contender, method: Method) -> Method:
+    """The same without poses; what has no warp needs none."""
+    return method.told("state not moved", without_poses) if contender.warps else method
 
 
 def movement_speed(bench: Bench) -> Table:
     """From a calm head to a violent one."""
     methods = []
-    for _, warm in one_iteration(bench):
-        methods += [warm, not_moved(warm)]
+    for contender, warm in one_iteration(bench):
+        methods += [warm, not_moved(contender, warm)]
     methods += sgbm_methods()[:1]
-    cells: dict[str, dict[str, float]] = {method.label: {} for method in methods}
+    cells: dict[str, dict[str, float]] = {method.label: {} for method in methods}  # each once
     for speed in SPEEDS:
         for label, tally in bench.tallies(bench.short_clips(speed), methods).items():
             cells[label][f"{speed}x"] = epe(tally)
@@ -149,7 +150,9 @@ def movement_speed(bench: Bench) -> Table:
 def pose_noise(bench: Bench, levels: Sequence[int] = range(11)) -> Table:
     """The tracker's errors, from none to far beyond any tracker."""
     cells: dict[str, dict[str, float]] = {}
-    for _, warm in one_iteration(bench):
+    for contender, warm in one_iteration(bench):
+        if not contender.warps:
+            continue
         told = {level: told_noise(warm, level) for level in levels}
         found = bench.tallies(bench.short_clips(1), list(told.values()))
         cells[warm.label] = {str(k): epe(found[method.label]) for k, method in told.items()}
@@ -158,7 +161,7 @@ def pose_noise(bench: Bench, levels: Sequence[int] = range(11)) -> Table:
         title="Noise of the poses, levels 0 to 10",
         text=f"EPE in px on {bench.short_clips(1).words}. At level k every motion from one frame "
         f"to the next is off by k x {NOISE_DEG} degrees and k x {1e3 * NOISE_M:g} mm, in random "
-        "directions that are the same at each level.",
+        "directions that are the same at each level. Networks without a warp see no poses.",
         columns={str(level): str(level) for level in levels},
         rows=[Row(label, values) for label, values in cells.items()],
         training=training_of(bench.contenders),
@@ -210,12 +213,18 @@ def cold_start(bench: Bench) -> Table:
         findings=cold_start_findings([row for row in rows if "every frame" not in row.label]),
         paper=paper.COLD_START,
         paper_note=paper.SOURCE,
-        curves=[
-            Curve(label, [float(k + 1) for k in range(len(epes))], epes)
-            for label, epes in curves.items()
-        ],
+        curves=curves_of(curves),
         x_label="frame",
     )
+
+
+def curves_of(epe_by_frame: dict[str, list[float]]) -> list[Curve]:
+    """Curves over the number of the frame; none of lone pairs."""
+    return [
+        Curve(label, [float(k + 1) for k in range(len(epes))], epes)
+        for label, epes in epe_by_frame.items()
+        if len(epes) > 1
+    ]
 
 
 def on_data(bench: Bench, group: Group, name: str) -> Table:
@@ -229,6 +238,8 @@ def on_data(bench: Bench, group: Group, name: str) -> Table:
         rows=rows_of(found),
         training=training_of(bench.contenders),
         findings=main_findings(bench.contenders, found),
+        curves=curves_of({label: tally.epe_by_frame() for label, tally in found.items()}),
+        x_label="frame",
     )
 
 
