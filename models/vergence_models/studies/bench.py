@@ -43,7 +43,7 @@ class Bench:
         return self._group(1, self.settings.frames)
 
     def short_clips(self, speed: int) -> Group:
-        """The first frames of the held-out clips, played back at a speed."""
+        """Shorter ones of the same scenes, played back at a speed."""
         return self._group(speed, self.settings.short)
 
     def _group(self, speed: int, frames: int) -> Group:

@@ -50,15 +50,14 @@ class StudySettings:
 def clips_at(
     speed: int, settings: StudySettings, cache: Path, *, frames: int, workers: int
 ) -> Group:
-    """The first frames of the scenes at one speed; renders what the cache lacks, clip by clip."""
+    """The scenes at one speed; renders what the cache lacks, clip by clip."""
     s = settings
-    rendered = s.frames if speed == 1 else s.short
     looks = f"_{s.textures.name}" if s.textures else ""
-    folder = cache / f"{s.width}x{s.height}{looks}" / f"speed_{speed}_frames_{rendered}"
+    folder = cache / f"{s.width}x{s.height}{looks}" / f"speed_{speed}_frames_{frames}"
     config = GeneratorConfig(
         width=s.width,
         height=s.height,
-        frames=rendered,
+        frames=frames,
         playback=Playback(speed),
         textures=s.textures,
     )

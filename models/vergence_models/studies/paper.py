@@ -33,6 +33,6 @@ NOISE_NOTE = (
     "we found. It states that ORB-SLAM3 on their headset stays within 0.3 degrees and 0.5 mm."
 )
 KITTI = [
-    Row("Ours, 5 iterations", {"epe": 1.66}),
-    Row("RAFT-Stereo RT, single frame, 20 iterations", {"epe": 1.77}),
+    Row("Ours, 5 iterations, trained on KITTI", {"epe": 1.66}),
+    Row("RAFT-Stereo RT, single frame, 20 iterations, trained on KITTI", {"epe": 1.77}),
 ]
