@@ -26,7 +26,7 @@ from vergence_service.batcher import StepBatcher
 from vergence_service.border import Answer, view_of
 from vergence_service.continuity import ContinuityLimits
 from vergence_service.metrics import Metrics
-from vergence_service.model import Step, View, state_bytes
+from vergence_service.model import RecurrentState, Step, View, state_bytes
 from vergence_service.rectify import Rectifier
 from vergence_service.streams import Attachment, Notice, NoticeKind, Opening, Stream, StreamTable
 
@@ -145,20 +145,28 @@ class DepthEngine:
         """
         stream = self.streams.get(stream_id)
         self.streams.touch(stream)
-        return await self._step(stream, decode, arrived_s=arrived_s, max_age_s=max_age_s)
+        answer = await self._step(stream, decode, arrived_s=arrived_s, max_age_s=max_age_s)
+        return await asyncio.to_thread(answer.disparity_map)
 
-    async def open_apart(self, opening: Opening) -> Stream:
+    async def open_apart(self, opening: Opening, *, state: RecurrentState | None = None) -> Stream:
         """A stream that nobody attaches to, for a sequence that is known from its first frame on.
 
         It is in no table: it takes no place from live streams, and ends with its last reference.
-        Raises NotReady, Draining, BadCalibration, FrameTooLarge.
+        ``state`` is what the frames before have left. Raises NotReady, Draining, BadCalibration,
+        FrameTooLarge.
         """
         rectifier = await self._rectifier(opening.rig)
-        return Stream("", "", b"", opening, rectifier, 0, None, self._clock())
+        origin = Origin.COLD_START if state is None else Origin.WARM
+        return Stream(
+            "", "", b"", opening, rectifier, 0, None, self._clock(), state=state, origin=origin
+        )
 
-    async def step_apart(self, stream: Stream, decode: Callable[[], StereoFrame]) -> DisparityMap:
-        """As :meth:`step`, of a stream that :meth:`open_apart` made."""
-        return await self._step(stream, decode, arrived_s=self._clock(), max_age_s=None)
+    async def step_apart(
+        self, stream: Stream, decode: Callable[[], StereoFrame]
+    ) -> tuple[DisparityMap, RecurrentState]:
+        """As :meth:`step`, of a stream that :meth:`open_apart` made; and the state that it left."""
+        answer = await self._step(stream, decode, arrived_s=self._clock(), max_age_s=None)
+        return await asyncio.to_thread(answer.disparity_map), answer.timed.result.state
 
     async def _step(
         self,
@@ -167,18 +175,17 @@ class DepthEngine:
         *,
         arrived_s: float,
         max_age_s: float | None,
-    ) -> DisparityMap:
+    ) -> Answer:
         # The lock wakes its waiters in order, so a stream takes its frames one at a time as they
         # arrived, and no batch ever holds two frames of one stream.
         async with stream.turn:
             try:
-                answer = await self._advance(stream, decode, arrived_s, max_age_s)
+                return await self._advance(stream, decode, arrived_s, max_age_s)
             except DepthError as error:
                 self.count_failed(stream, error)
                 if isinstance(error, NonFinite):
                     stream.forget(Origin.RESET_NON_FINITE)
                 raise
-        return await asyncio.to_thread(answer.disparity_map)
 
     async def reset(self, stream_id: str) -> None:
         """Frames after it start from nothing. Raises UnknownStream, StreamExpired."""

@@ -77,6 +77,7 @@ async def serving_http(
                     limits=QueueLimits(
                         waiting=batch.waiting,
                         waiting_per_client=batch.waiting_per_client,
+                        checkpoint_s=batch.checkpoint_s,
                         keep_s=batch.keep_h * 3600,
                         disk_bytes=batch.disk_mib * _MIB,
                     ),

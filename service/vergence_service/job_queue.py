@@ -22,7 +22,7 @@ from vergence_proto.errors import (
 from vergence_proto.layouts import StereoSource
 from vergence_service.contents import check_folder
 from vergence_service.engine import DepthEngine
-from vergence_service.job_run import opening_of, run_job
+from vergence_service.job_run import Progress, opening_of, run_job
 from vergence_service.job_shelf import JobShelf
 from vergence_service.jobs import (
     Job,
@@ -50,6 +50,7 @@ _USUAL_JOB_S = 2.0
 class QueueLimits:
     waiting: int  # jobs, the running ones included
     waiting_per_client: int | None
+    checkpoint_s: float  # of work that a crash may cost
     keep_s: float  # what has ended
     disk_bytes: int  # of all jobs together
 
@@ -67,8 +68,7 @@ class JobStatus:
 
 @dataclass(slots=True, eq=False)
 class _Running:
-    since_s: float
-    frames_done: int = 0
+    progress: Progress = field(default_factory=Progress)
     task: asyncio.Task[None] | None = None
     stepped: asyncio.Event = field(default_factory=asyncio.Event)  # the model is free again
 
@@ -174,9 +174,8 @@ class JobQueue:
             done = job.frames if job.state is JobState.DONE else 0
             ahead = 0 if job.ended else self._shelf.unfinished().index(job)
             return JobStatus(job, done, ahead, job.fps, None)
-        fps = running.frames_done / max(time.monotonic() - running.since_s, 1e-6)
-        left = job.frames - running.frames_done
-        return JobStatus(job, running.frames_done, 0, fps or None, left / fps if fps else None)
+        done, fps = running.progress.frames_done, running.progress.fps
+        return JobStatus(job, done, 0, fps or None, (job.frames - done) / fps if fps else None)
 
     def statuses(self) -> list[JobStatus]:
         """Of all jobs, oldest first."""
@@ -222,7 +221,7 @@ class JobQueue:
                 if job is None:
                     await self._shelf.change(within_s=_EXPIRE_EVERY_S)
                     continue
-                running = self._running[job.job_id] = _Running(time.monotonic())
+                running = self._running[job.job_id] = _Running()
                 name = f"sequence {job.job_id}"
                 running.task = tasks.create_task(self._run(job, running), name=name)
                 # While one is put away the next is stepped, and no more: disks can be slow.
@@ -236,7 +235,7 @@ class JobQueue:
             try:
                 ended = await self._stepped(job, running)
             finally:
-                self._last_job_s = time.monotonic() - running.since_s
+                self._last_job_s = time.monotonic() - running.progress.since_s
                 running.stepped.set()
             await self._shelf.put_away(ended)
         except (Draining, NotReady):
@@ -256,12 +255,15 @@ class JobQueue:
         started = replace(job, state=JobState.RUNNING, attempts=job.attempts + 1)
         await self._shelf.update(started)
 
-        def count_frame() -> None:
-            running.frames_done += 1
-
         try:
             folder = self._shelf.folder(job.job_id)
-            found = await run_job(self._engine, folder, started, count_frame)
+            found = await run_job(
+                self._engine,
+                folder,
+                started,
+                running.progress,
+                checkpoint_s=self._limits.checkpoint_s,
+            )
         except (Draining, NotReady, asyncio.CancelledError):
             # Not the sequence's doing: it keeps its place, for this server or the next one.
             await self._shelf.update(replace(job, state=JobState.QUEUED))
@@ -271,9 +273,10 @@ class JobQueue:
         except Exception:
             log.exception("sequence %s failed in a way that nobody foresaw", job.job_id)
             return _failed(started, ModelFailed("the server failed; its log says why"))
-        fps = job.frames / (time.monotonic() - running.since_s)
         accuracy = None if found is None else asdict(found)
-        return replace(started, state=JobState.DONE, fps=fps, accuracy=accuracy)
+        return replace(
+            started, state=JobState.DONE, fps=running.progress.fps or None, accuracy=accuracy
+        )
 
     async def _expire_now_and_then(self) -> None:
         while True:

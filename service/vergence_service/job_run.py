@@ -1,17 +1,19 @@
-"""One run of one job: its input stepped from the first frame to the last, its result on disk."""
+"""One run of one job: its input stepped to the last frame, its result on disk."""
 
 import asyncio
+import time
 from collections import deque
-from collections.abc import Callable
 from contextlib import aclosing
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from vergence_proto.accuracy import Accuracy, accuracy
 from vergence_proto.layouts import LayoutError, StereoSource
 from vergence_proto.types import Delivery, OutputFormat
+from vergence_service.checkpoints import Checkpoint, read_checkpoint, write_checkpoint
 from vergence_service.engine import DepthEngine
 from vergence_service.jobs import Job, JobOptions, Output
-from vergence_service.results import start_result, write_frame
+from vergence_service.results import holds_frames, start_result, write_frame
 from vergence_service.sequences import (
     Stepped,
     open_below,
@@ -23,6 +25,21 @@ from vergence_service.streams import Opening
 
 # Frames that are being written while the next ones are stepped.
 _UNWRITTEN = 2
+_CHECKPOINT = "checkpoint"
+
+
+@dataclass(slots=True, eq=False)
+class Progress:
+    """How far a run is."""
+
+    since_s: float = field(default_factory=time.monotonic)
+    frames_found: int = 0  # that an earlier run had done
+    frames_done: int = 0  # those included
+
+    @property
+    def fps(self) -> float:
+        elapsed_s = time.monotonic() - self.since_s
+        return (self.frames_done - self.frames_found) / max(elapsed_s, 1e-6)
 
 
 def opening_of(source: StereoSource, options: JobOptions) -> Opening:
@@ -41,27 +58,41 @@ def opening_of(source: StereoSource, options: JobOptions) -> Opening:
 
 
 async def run_job(
-    engine: DepthEngine, folder: Path, job: Job, on_frame: Callable[[], None]
+    engine: DepthEngine, folder: Path, job: Job, progress: Progress, *, checkpoint_s: float
 ) -> Accuracy | None:
-    """Fill ``folder``/result from ``folder``/input, from the start, whatever is there already.
+    """Fill ``folder``/result from ``folder``/input, from where an earlier run has left it.
 
-    Returns the mean accuracy if the job asks for it and there is truth. Raises as step_all, and
-    BadSequence: a file of the input cannot be read.
+    What a crash costs is at most the work of the last ``checkpoint_s``. Returns the mean accuracy
+    if the job asks for it and there is truth. Raises as step_all, and BadSequence: a file of the
+    input cannot be read.
     """
     source = await asyncio.to_thread(open_below, folder / "input", job.source)
     if not job.options.metrics:
         source = without_truth(source)
-    found: list[Accuracy] = []
-    writing: deque[asyncio.Task[Accuracy | None]] = deque()
+    before = await asyncio.to_thread(_found, folder, engine.card.weights_sha256)
+    start, state = (before.frames, before.state) if before else (0, None)
+    measured = list(before.measured) if before else []
+    progress.frames_found = progress.frames_done = start
+    checkpoint_due_s = time.monotonic() + checkpoint_s
+    writing: deque[tuple[Stepped, asyncio.Task[Accuracy | None]]] = deque()
 
     async def settle() -> None:
-        measured = await writing.popleft()
-        if measured is not None:
-            found.append(measured)
-        on_frame()
+        nonlocal checkpoint_due_s
+        stepped, written = writing.popleft()
+        found = await written
+        if found is not None:
+            measured.append(found)
+        progress.frames_done += 1
+        if time.monotonic() >= checkpoint_due_s:
+            checkpoint = Checkpoint(
+                progress.frames_done, stepped.state, engine.card.weights_sha256, tuple(measured)
+            )
+            await asyncio.to_thread(write_checkpoint, folder / _CHECKPOINT, checkpoint)
+            checkpoint_due_s = time.monotonic() + checkpoint_s
 
+    steps = step_all(engine, source, opening_of(source, job.options), start=start, state=state)
     try:
-        async with aclosing(step_all(engine, source, opening_of(source, job.options))) as steps:
+        async with aclosing(steps):
             async for stepped in steps:
                 if stepped.index == 0:
                     rig = stepped.disparity.rig
@@ -69,16 +100,24 @@ async def run_job(
                 if len(writing) == _UNWRITTEN:
                     await settle()
                 keep = asyncio.to_thread(_keep, folder / "result", stepped)
-                writing.append(asyncio.create_task(keep))
+                writing.append((stepped, asyncio.create_task(keep)))
         while writing:
             await settle()
     except LayoutError as error:
         raise sequence_error(error, folder / "input") from None
     finally:
         # Nothing is written any more once this has returned, so the folder can be removed.
-        await asyncio.gather(*writing, return_exceptions=True)
-    mean = Accuracy.mean(found)
+        await asyncio.gather(*(task for _, task in writing), return_exceptions=True)
+    mean = Accuracy.mean(measured)
     return mean if mean.n else None
+
+
+def _found(folder: Path, weights_sha256: str) -> Checkpoint | None:
+    """What can be gone on from: all of a result comes from the same weights."""
+    checkpoint = read_checkpoint(folder / _CHECKPOINT)
+    if checkpoint is None or checkpoint.weights_sha256 != weights_sha256:
+        return None
+    return checkpoint if holds_frames(folder / "result", checkpoint.frames) else None
 
 
 def _keep(folder: Path, stepped: Stepped) -> Accuracy | None:

@@ -2,10 +2,11 @@
 
 ::
 
-    DIRECTORY/jobs.sqlite3      a row a job; a job is accepted once its row is committed
-    DIRECTORY/incoming/ID/      uploads that are not accepted yet; emptied at every start
-    DIRECTORY/jobs/ID/input     what was uploaded, unpacked; removed when the job ends
-    DIRECTORY/jobs/ID/result    see :mod:`vergence_service.results`
+    DIRECTORY/jobs.sqlite3        a row a job; a job is accepted once its row is committed
+    DIRECTORY/incoming/ID/        uploads that are not accepted yet; emptied at every start
+    DIRECTORY/jobs/ID/input       what was uploaded, unpacked; removed when the job ends
+    DIRECTORY/jobs/ID/checkpoint  how far it is, see :mod:`vergence_service.checkpoints`; so is this
+    DIRECTORY/jobs/ID/result      see :mod:`vergence_service.results`
 """
 
 import json
@@ -169,6 +170,7 @@ class JobStore:
     def tidy(self, job: Job) -> None:
         """Remove what a job that has ended does not need any more."""
         remove_folder(self.folder(job.job_id) / "input")
+        (self.folder(job.job_id) / "checkpoint").unlink(missing_ok=True)
         if job.state is JobState.FAILED:
             remove_folder(self.folder(job.job_id) / "result")
 

@@ -74,6 +74,19 @@ def write_frame(folder: Path, index: int, disparity: DisparityMap) -> None:
     np.savez(folder / f"{index:06d}.npz", allow_pickle=False, **arrays)
 
 
+def holds_frames(folder: Path, count: int) -> bool:
+    """Whether the first ``count`` are there and whole; what was written last may not be."""
+    try:
+        RectifiedRig(**json.loads((folder / _RIG).read_text("utf-8")))
+        for index in range(count):
+            with zipfile.ZipFile(folder / f"{index:06d}.npz") as file:
+                if file.testzip() is not None:
+                    return False
+    except (OSError, TypeError, ValueError, zipfile.BadZipFile):
+        return False
+    return True
+
+
 def read_frames(folder: Path) -> Iterator[FrameResult]:
     rig = RectifiedRig(**json.loads((folder / _RIG).read_text("utf-8")))
     for path in sorted(folder.glob("*.npz")):

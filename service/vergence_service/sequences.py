@@ -19,6 +19,7 @@ from vergence_proto.layouts import (
 )
 from vergence_proto.types import DisparityMap
 from vergence_service.engine import DepthEngine
+from vergence_service.model import RecurrentState
 from vergence_service.streams import Opening, Stream
 
 # One step is in the model while the answer of the one before is made ready.
@@ -33,17 +34,25 @@ class Stepped:
     index: int  # from 0
     source: SourceFrame
     disparity: DisparityMap
+    state: RecurrentState  # that it left
 
 
 async def step_all(
-    engine: DepthEngine, source: StereoSource, opening: Opening
+    engine: DepthEngine,
+    source: StereoSource,
+    opening: Opening,
+    *,
+    start: int = 0,
+    state: RecurrentState | None = None,
 ) -> AsyncGenerator[Stepped, None]:
     """Every frame of ``source`` in order, each on the state that its predecessor left.
 
+    Or every one from ``start`` on, whose predecessor left ``state``.
+
     Raises what DepthEngine.open_apart and step_apart raise; LayoutError: a file cannot be read.
     """
-    stream = await engine.open_apart(opening)
-    frames = read_ahead(source)
+    stream = await engine.open_apart(opening, state=state)
+    frames = read_ahead(source, start=start)
     waiting: deque[asyncio.Task[Stepped]] = deque()
     try:
         async for index, frame in frames:
@@ -59,7 +68,8 @@ async def step_all(
 
 
 async def _step(engine: DepthEngine, stream: Stream, index: int, source: SourceFrame) -> Stepped:
-    return Stepped(index, source, await engine.step_apart(stream, lambda: source.frame))
+    disparity, state = await engine.step_apart(stream, lambda: source.frame)
+    return Stepped(index, source, disparity, state)
 
 
 def without_truth(source: StereoSource) -> StereoSource:

@@ -48,6 +48,7 @@ class BatchSettings(_Section):
     )
     waiting: PositiveInt = Field(default=64, description="sequences, the running one included")
     waiting_per_client: PositiveInt | None = Field(default=None, description="those of one address")
+    checkpoint_s: PositiveFloat = Field(default=2.0, description="of work that a crash may cost")
     keep_h: PositiveFloat = Field(default=24.0, description="results, unless space runs short")
     disk_mib: PositiveInt = Field(default=20_480, description="of all jobs together")
     max_upload_mib: PositiveInt = 4096

@@ -3,6 +3,7 @@
 import asyncio
 import io
 import json
+import re
 import socket
 import sys
 from collections.abc import AsyncIterator
@@ -13,6 +14,7 @@ import httpx
 import numpy as np
 from rich.console import Console
 
+from tests.client.waiting import eventually
 from tests.support.http import disparities, ended, files_below, http_server, submit
 from tests.support.models import RecallModel
 from tests.support.sequences import make_frames, sequence_files, write_sequence, zip_bytes
@@ -66,6 +68,37 @@ async def test_a_killed_server_finishes_all_that_it_accepted(tmp_path: Path) -> 
             job = await submit(client, archive)
             await ended(client, job["id"])
             np.testing.assert_array_equal(maps, await disparities(client, job["id"]))
+
+
+def checkpoints_below(directory: Path) -> list[Path]:
+    return list(directory.glob("jobs/*/checkpoint"))
+
+
+async def frames_stepped(client: httpx.AsyncClient) -> int:
+    text = (await client.get("/metrics")).text
+    counts = re.findall(r"^vergence_frames_stepped_total\{.*\} (.+)$", text, re.MULTILINE)
+    return round(sum(map(float, counts)))
+
+
+async def test_a_sequence_goes_on_from_where_it_was_when_the_server_was_killed(
+    tmp_path: Path,
+) -> None:
+    archive = zip_bytes(sequence_files(make_frames(60)))
+    async with killed_server(tmp_path, step_s=0.02) as client:
+        job_id = (await submit(client, archive, metrics=True))["id"]
+        await eventually(lambda: checkpoints_below(tmp_path))
+    async with killed_server(tmp_path) as client:
+        job = await ended(client, job_id)
+        resumed = await disparities(client, job_id)
+        stepped = await frames_stepped(client)
+        assert not checkpoints_below(tmp_path)
+    assert job["state"] == "done"
+    assert 0 < stepped < 60, "the second server began at the first frame"
+
+    async with http_server(RecallModel()) as client:
+        whole = await ended(client, (await submit(client, archive, metrics=True))["id"])
+        np.testing.assert_array_equal(resumed, await disparities(client, whole["id"]))
+    assert job["accuracy"] == whole["accuracy"]
 
 
 async def test_a_batch_goes_on_when_its_server_is_killed_and_comes_back(tmp_path: Path) -> None:

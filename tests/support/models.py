@@ -1,6 +1,7 @@
 """A network small enough to know by heart: its memory, its failures and its pace are visible."""
 
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -73,3 +74,15 @@ class RecallModel:
     def wait_until_entered(self) -> None:
         """Block until one more step than before has reached the model."""
         assert self._entered.acquire(timeout=30)
+
+
+class PacedModel(RecallModel):
+    """Takes its time, so that others can see how far a sequence is."""
+
+    def __init__(self, step_s: float) -> None:
+        super().__init__()
+        self._step_s = step_s
+
+    def step(self, steps: Sequence[Step]) -> list[StepResult]:
+        time.sleep(self._step_s)
+        return super().step(steps)

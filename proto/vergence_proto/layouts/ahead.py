@@ -6,14 +6,16 @@ from collections.abc import AsyncGenerator, Iterator
 from vergence_proto.layouts.source import SourceFrame, StereoSource
 
 
-async def read_ahead(source: StereoSource) -> AsyncGenerator[tuple[int, SourceFrame], None]:
-    """Index from 0 and frame, each decoded in a thread while the one before is in use.
+async def read_ahead(
+    source: StereoSource, *, start: int = 0
+) -> AsyncGenerator[tuple[int, SourceFrame], None]:
+    """Index from ``start`` and frame, each decoded in a thread while the one before is in use.
 
     Raises LayoutError: a file cannot be read.
     """
-    frames: Iterator[SourceFrame] = iter(source)
+    frames: Iterator[SourceFrame] = (source[index] for index in range(start, len(source)))
     coming = asyncio.create_task(asyncio.to_thread(next, frames, None))
-    index = 0
+    index = start
     try:
         while (frame := await coming) is not None:
             coming = asyncio.create_task(asyncio.to_thread(next, frames, None))

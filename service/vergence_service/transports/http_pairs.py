@@ -104,7 +104,7 @@ def pair_routes(engine: DepthEngine, *, limits: UploadLimits) -> APIRouter:
         )
         stream = await engine.open_apart(opening)
         frame = StereoFrame(1, 0, left, right)
-        disparity = await engine.step_apart(stream, lambda: frame)
+        disparity, _ = await engine.step_apart(stream, lambda: frame)
         wanted = disparity.depth_m if query.output is PairOutput.DEPTH else disparity.disparity_px
         return await asyncio.to_thread(_encoded, wanted, query.format)
 
