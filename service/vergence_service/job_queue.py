@@ -7,6 +7,7 @@ import time
 from collections.abc import AsyncIterator
 from contextlib import AbstractContextManager, asynccontextmanager
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Self
 
@@ -29,10 +30,10 @@ from vergence_service.jobs import (
     JobOptions,
     JobState,
     JobStore,
-    Output,
     folder_bytes,
     remove_folder,
 )
+from vergence_service.results import result_bytes
 from vergence_service.sequences import find_sequence, open_below
 
 log = logging.getLogger(__name__)
@@ -90,6 +91,10 @@ class JobQueue:
         self._last_job_s = _USUAL_JOB_S
         self._uploads: list[str] = []  # whose they are
         self._tasks: list[asyncio.Task[None]] = []
+        self._metrics = engine.metrics
+        self._metrics.sequence_disk_bytes.set_function(self._shelf.taken_bytes)
+        for state in (JobState.QUEUED, JobState.RUNNING):
+            self._metrics.sequences.labels(state).set_function(partial(self._count, state))
 
     async def __aenter__(self) -> Self:
         await self._shelf.load()
@@ -160,7 +165,7 @@ class JobQueue:
             created_s=time.time(),
             client=client,
             options=options,
-            disk_bytes=uploaded + _result_bytes(source, options),
+            disk_bytes=uploaded + result_bytes(source, options.outputs),
         )
         await self._shelf.make_room(job.disk_bytes, retry_after_s=self._usual_job_s())
         await self._shelf.accept(folder, job)
@@ -237,6 +242,8 @@ class JobQueue:
             finally:
                 self._last_job_s = time.monotonic() - running.progress.since_s
                 running.stepped.set()
+            # Before anybody can hear of the end in another way.
+            self._count_ended(ended, running.progress)
             await self._shelf.put_away(ended)
         except (Draining, NotReady):
             self._leaving = True
@@ -278,6 +285,16 @@ class JobQueue:
             started, state=JobState.DONE, fps=running.progress.fps or None, accuracy=accuracy
         )
 
+    def _count(self, state: JobState) -> int:
+        return sum(job.state is state for job in self._shelf)
+
+    def _count_ended(self, job: Job, progress: Progress) -> None:
+        if job.state is JobState.DONE:
+            self._metrics.sequences_done.inc()
+            self._metrics.sequence_s.observe(time.monotonic() - progress.since_s)
+        else:
+            self._metrics.sequences_failed.labels(job.reason).inc()
+
     async def _expire_now_and_then(self) -> None:
         while True:
             await self._shelf.expire()
@@ -296,11 +313,6 @@ def _find(folder: Path, wanted: str | None, *, max_pixels: int) -> tuple[str, St
     check_folder(folder, max_pixels=max_pixels)
     spec = find_sequence(folder, wanted)
     return spec, open_below(folder, spec)
-
-
-def _result_bytes(source: StereoSource, options: JobOptions) -> int:
-    pixels = source.rig.left.width * source.rig.left.height
-    return len(source) * pixels * (5 if Output.CONFIDENCE in options.outputs else 4)
 
 
 def _failed(job: Job, error: DepthError) -> Job:

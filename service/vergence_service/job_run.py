@@ -83,6 +83,7 @@ async def run_job(
         if found is not None:
             measured.append(found)
         progress.frames_done += 1
+        engine.metrics.sequence_frames.inc()
         if time.monotonic() >= checkpoint_due_s:
             checkpoint = Checkpoint(
                 progress.frames_done, stepped.state, engine.card.weights_sha256, tuple(measured)

@@ -101,6 +101,10 @@ class JobShelf:
         finally:
             self._readers[job_id] -= 1
 
+    def taken_bytes(self) -> int:
+        """What all jobs take on disk, or may until they end."""
+        return sum(job.disk_bytes for job in self._jobs.values())
+
     async def expire(self) -> None:
         """Remove what ended too long ago."""
         before_s = time.time() - self._keep_s
@@ -116,21 +120,18 @@ class JobShelf:
                 f"{self._disk_bytes} for all; send it in parts"
             )
         for job in sorted(self._removable(), key=lambda job: job.finished_s or 0):
-            if self._taken_bytes() + needed_bytes <= self._disk_bytes:
+            if self.taken_bytes() + needed_bytes <= self._disk_bytes:
                 return
             await self.remove(job.job_id)
-        if self._taken_bytes() + needed_bytes > self._disk_bytes:
+        if self.taken_bytes() + needed_bytes > self._disk_bytes:
             raise QueueFull(
-                f"the sequences that wait take {self._taken_bytes()} of {self._disk_bytes} bytes "
+                f"the sequences that wait take {self.taken_bytes()} of {self._disk_bytes} bytes "
                 f"on disk, this one needs {needed_bytes}; try again later",
                 retry_after_s=retry_after_s,
             )
 
     def _removable(self) -> list[Job]:
         return [job for job in self if job.ended and self._readers[job.job_id] == 0]
-
-    def _taken_bytes(self) -> int:
-        return sum(job.disk_bytes for job in self._jobs.values())
 
     async def _tell(self) -> None:
         async with self._changed:

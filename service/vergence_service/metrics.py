@@ -3,6 +3,7 @@
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 
 _STAGE_BUCKETS_S = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.033, 0.05, 0.1, 0.2, 0.5, 1.0)
+_SEQUENCE_BUCKETS_S = (0.1, 0.5, 1, 5, 10, 30, 60, 300, 600, 1800, 3600, 7200)
 
 
 class Metrics:
@@ -36,4 +37,28 @@ class Metrics:
         )
         self.state_bytes = Gauge(
             "vergence_state_bytes", "Memory reserved for states", registry=registry
+        )
+        self.sequences = Gauge(
+            "vergence_sequences",
+            "Accepted sequences that have not ended",
+            ["state"],
+            registry=registry,
+        )
+        self.sequences_done = Counter(
+            "vergence_sequences_done", "Sequences that were done", registry=registry
+        )
+        self.sequences_failed = Counter(
+            "vergence_sequences_failed", "Sequences that failed", ["reason"], registry=registry
+        )
+        self.sequence_frames = Counter(
+            "vergence_sequence_frames", "Frames of sequences, results on disk", registry=registry
+        )
+        self.sequence_s = Histogram(
+            "vergence_sequence_seconds",
+            "Time of one run of a sequence, from its start to its end",
+            buckets=_SEQUENCE_BUCKETS_S,
+            registry=registry,
+        )
+        self.sequence_disk_bytes = Gauge(
+            "vergence_sequence_disk_bytes", "Disk that sequences take or may", registry=registry
         )

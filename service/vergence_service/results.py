@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vergence_proto.geometry import RectifiedRig
-from vergence_proto.layouts import encode_disparity_png, encode_pfm
+from vergence_proto.layouts import StereoSource, encode_disparity_png, encode_pfm
 from vergence_proto.types import DisparityMap, Plane
 from vergence_service.jobs import Output
 
@@ -72,6 +72,12 @@ def write_frame(folder: Path, index: int, disparity: DisparityMap) -> None:
     if disparity.confidence is not None:
         arrays["confidence"] = disparity.confidence
     np.savez(folder / f"{index:06d}.npz", allow_pickle=False, **arrays)
+
+
+def result_bytes(source: StereoSource, outputs: Collection[Output]) -> int:
+    """What the result of a whole sequence will take."""
+    pixels = source.rig.left.width * source.rig.left.height
+    return len(source) * pixels * (5 if Output.CONFIDENCE in outputs else 4)
 
 
 def holds_frames(folder: Path, count: int) -> bool:

@@ -47,5 +47,13 @@ def state_from_bytes(data: bytes) -> RecurrentState:
             world_from_left=None if pose is None else Pose.from_matrix(np.array(pose)),
             **about,
         )
-    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+    except (
+        OSError,
+        EOFError,
+        KeyError,
+        TypeError,
+        ValueError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ) as error:
         raise BadSnapshot(f"expected a recurrent state: {error}") from None

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import httpx
 import numpy as np
 
 from tests.support.frames import frame_message, make_frame
@@ -18,7 +19,7 @@ from tests.support.http import (
     reason_of,
     submit,
 )
-from tests.support.models import RecallModel
+from tests.support.models import RAISES, RecallModel
 from tests.support.sequences import make_frames, sequence_files, zip_bytes
 from tests.support.server import raw_stream, running_server
 from vergence_service.jobs import JobState, JobStore
@@ -59,6 +60,32 @@ async def test_a_sequence_that_keeps_killing_the_server_is_given_up(tmp_path: Pa
         failed = await ended(client, deadly["id"])
     assert (failed["state"], failed["reason"]) == ("failed", "MODEL_FAILED")
     assert "died 4 times" in failed["message"]
+
+
+async def test_prometheus_hears_of_sequences() -> None:
+    async def told(client: httpx.AsyncClient) -> dict[str, float]:
+        lines = (await client.get("/metrics")).text.splitlines()
+        pairs = (line.rsplit(" ", 1) for line in lines if line.startswith("vergence_sequence"))
+        return {name.removeprefix("vergence_"): float(value) for name, value in pairs}
+
+    model = RecallModel()
+    async with http_server(model) as client:
+        with model.busy():
+            jobs = [await submit(client, ARCHIVE) for _ in range(3)]
+            await asyncio.to_thread(model.wait_until_entered)
+            waiting = await told(client)
+        good = [await ended(client, job["id"]) for job in jobs]
+        bad_frames = [*make_frames(2), make_frame(3, brightness=RAISES)]
+        bad = await submit(client, zip_bytes(sequence_files(bad_frames)))
+        assert (await ended(client, bad["id"]))["state"] == "failed"
+        after = await told(client)
+    assert waiting['sequences{state="queued"}'] == 2
+    assert waiting['sequences{state="running"}'] == 1
+    assert waiting["sequence_disk_bytes"] > 0
+    assert after['sequences{state="queued"}'] == after['sequences{state="running"}'] == 0
+    assert after["sequences_done_total"] == after["sequence_seconds_count"] == 3
+    assert after['sequences_failed_total{reason="MODEL_FAILED"}'] == 1
+    assert after["sequence_frames_total"] >= sum(job["frames"] for job in good)
 
 
 async def test_results_expire_by_age(tmp_path: Path) -> None:
