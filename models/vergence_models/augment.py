@@ -1,4 +1,4 @@
-"""Stretched windows of clips: larger disparities, wider occlusions, other cameras, for nothing."""
+"""What training does to clips: windows blown up to larger disparities, and flawed cameras."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from vergence_models.data.clips import StereoClips
+from vergence_models.data.sensor import film_as_sensor
 
 MAX_STRETCH = 4.0
 
@@ -23,6 +24,14 @@ def stretched(clips: StereoClips, random: np.random.Generator, *, share: float) 
     singles = [clips[index : index + 1] for index in range(len(clips))]
     return StereoClips.concatenate(
         [_stretched(one, random) if random.random() < share else one for one in singles]
+    )
+
+
+def filmed(clips: StereoClips, random: np.random.Generator, *, clean_share: float) -> StereoClips:
+    """Each clip as flawed cameras record it, or, with chance ``clean_share``, as it is."""
+    singles = [clips[index : index + 1] for index in range(len(clips))]
+    return StereoClips.concatenate(
+        [one if random.random() < clean_share else film_as_sensor(one, random) for one in singles]
     )
 
 

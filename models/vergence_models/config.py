@@ -4,10 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
+from enum import StrEnum
 
 
 class ConfigError(ValueError):
     """A configuration is unknown, or differs from the one a file was made with."""
+
+
+class Precision(StrEnum):
+    """What convolutions and matrix products are computed in while training; weights stay float32.
+
+    Geometry, losses and what onnxruntime runs are float32 in either case.
+    """
+
+    FP32 = "fp32"
+    BF16 = "bf16"
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +44,20 @@ class LiteNetworkConfig(NetworkConfig):
 
 
 @dataclass(frozen=True, slots=True)
+class RaftNetworkConfig(NetworkConfig):
+    """Of `full` and `fast`."""
+
+    warp: bool = True  # move the state to the new view; otherwise it stays where it was
+    encoder_half: int = 64  # at 1/2
+    encoder_quarter: int = 96
+    encoder_eighth: int = 128  # and 1/16
+    features: int = 256  # that are matched, at 1/8
+    hidden: int = 128  # recurrent state at 1/8 and at 1/16
+    motion: int = 64  # of each half of the motion encoder
+    head: int = 256  # inner width of the heads
+
+
+@dataclass(frozen=True, slots=True)
 class TrainingConfig:
     """How a network is trained; every field can be reached by the same name on the command line."""
 
@@ -50,7 +75,10 @@ class TrainingConfig:
     noise_share: float = 0.3  # clips whose poses are off by up to the two limits below
     noise_deg: float = 0.3
     noise_m: float = 0.002
+    clean_share: float = 0.3  # clips without the sensor's flaws
     reset_share: float = 0.1  # frames that lose their state
+    cold_iterations: int = 4  # at most, drawn anew for every frame without a state
+    precision: Precision = Precision.FP32
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +91,29 @@ class Config:
     iterations: tuple[int, ...] = (1, 2, 4, 8)  # graphs to export
 
 
-CONFIGS = {config.name: config for config in (Config("lite", LiteNetworkConfig()),)}
+# The paper's: Adam, no weight decay, an L1 loss that weighs every frame alike.
+RAFT_TRAINING = TrainingConfig(
+    learning_rate=4e-4, weight_decay=0.0, cold_iterations=6, precision=Precision.BF16
+)
+FAST_NETWORK = RaftNetworkConfig(
+    warp=False,
+    encoder_half=32,
+    encoder_quarter=48,
+    encoder_eighth=64,
+    features=128,
+    hidden=64,
+    motion=32,
+    head=128,
+)
+
+CONFIGS = {
+    config.name: config
+    for config in (
+        Config("lite", LiteNetworkConfig()),
+        Config("full", RaftNetworkConfig(), RAFT_TRAINING, iterations=(1, 2, 5, 7, 20)),
+        Config("fast", FAST_NETWORK, RAFT_TRAINING, iterations=(1, 2, 5, 7, 20)),
+    )
+}
 
 
 def load_config(name: str) -> Config:

@@ -1,7 +1,7 @@
 """``python -m vergence_models.export``: one ONNX graph per iteration count, and the manifest.
 
-The graphs hold the same weights. Each is checked against PyTorch over a short sequence before it is
-written down in the manifest.
+The graphs hold the same weights, those of large networks in one file beside them. Each is checked
+against PyTorch over a short sequence before it is written down in the manifest.
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ import dataclasses
 import hashlib
 import json
 import logging
-import warnings
+from collections.abc import Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import cast
 
 import numpy as np
@@ -20,24 +21,18 @@ import onnx
 import onnxruntime
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
 
 from vergence_models.config import Config, load_config
+from vergence_models.graphs import export_part, folded, whole_step
+from vergence_models.raft.network import RaftNetwork
+from vergence_models.raft.parts import parts_of
 from vergence_models.runs import Run, read_run
+from vergence_models.stitch import Parts, stitched, write_with_shared_weights
 from vergence_models.tiers import AnyNetwork, build_network
-from vergence_proto.model_io import (
-    DISPARITY,
-    LEFT,
-    MANIFEST_FORMAT,
-    MANIFEST_NAME,
-    RIGHT,
-    SIGMA,
-    UVD_CURR_FROM_PREV,
-)
+from vergence_proto.model_io import MANIFEST_FORMAT, MANIFEST_NAME
 
 log = logging.getLogger("vergence_models.export")
 
-OPSET = 18  # ScatterElements gained reduction="max" there
 # PyTorch and onnxruntime sum in different orders. Where two hypotheses are equally good that can
 # tip the choice, so a pixel here and there may differ by any amount; 99 of 100 must agree to this.
 PARITY_PX = 0.02
@@ -45,64 +40,6 @@ PARITY_PX = 0.02
 
 class ParityError(RuntimeError):
     """A graph does not compute what the PyTorch network computes."""
-
-
-class StepGraph(nn.Module):
-    """The step with flat tensors in and out, in the order of the contract."""
-
-    def __init__(self, network: AnyNetwork, iterations: int) -> None:
-        super().__init__()
-        self.network = network
-        self.iterations = iterations
-
-    def forward(
-        self, left: Tensor, right: Tensor, matrix: Tensor, *state: Tensor
-    ) -> tuple[Tensor, ...]:
-        estimate, following = self.network(left, right, matrix, state, self.iterations)
-        return estimate.disparity, estimate.sigma, *following
-
-
-def export_graph(network: AnyNetwork, iterations: int, path: Path) -> None:
-    """Write one graph with dynamic batch, height and width."""
-    config = network.config
-    stride = config.stride
-    batch = torch.export.Dim("batch", min=1, max=256)
-    rows = torch.export.Dim("rows", min=1, max=128)
-    columns = torch.export.Dim("columns", min=1, max=128)
-    image = {0: batch, 1: stride * rows, 2: stride * columns}
-    tensors = network.state_tensors
-    states = tuple(
-        {0: batch, 2: stride // t.scale * rows, 3: stride // t.scale * columns} for t in tensors
-    )
-    height, width = 6 * stride, 8 * stride
-    # Two tensors: the exporter would take one object for one input, and match left with left.
-    left, right = (torch.zeros(2, height, width, 3, dtype=torch.uint8) for _ in range(2))
-    matrices = torch.eye(4).repeat(2, 1, 1)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the exporter's own deprecations
-        torch.onnx.export(
-            StepGraph(network, iterations),
-            (left, right, matrices, *network.cold_state(2, height, width)),
-            str(path),
-            dynamo=True,
-            verbose=False,
-            external_data=False,
-            opset_version=OPSET,
-            dynamic_shapes=(image, image, {0: batch}, states),
-            input_names=[LEFT, RIGHT, UVD_CURR_FROM_PREV, *(t.input_name for t in tensors)],
-            output_names=[DISPARITY, SIGMA, *(t.output_name for t in tensors)],
-        )
-    slim(path)
-
-
-def slim(path: Path) -> None:
-    """Drop what the exporter notes about the author's machine (stack traces, file paths)."""
-    model = onnx.load(path)
-    for node in model.graph.node:
-        del node.metadata_props[:]
-    del model.graph.value_info[:]
-    del model.metadata_props[:]
-    onnx.save(model, path)
 
 
 def shifted_pair(
@@ -164,25 +101,47 @@ def export_run(run: Run, config: Config, out: Path) -> None:
     network = build_network(run.network).eval()
     network.load_state_dict(run.weights)
     out.mkdir(parents=True, exist_ok=True)
-    graphs = {}
-    for iterations in config.iterations:
-        path = out / f"{config.name}_{iterations}.onnx"
-        export_graph(network, iterations, path)
-        worst = check_parity(network, iterations, path)
-        log.info("%s: 99 %% of pixels within %.1e px of PyTorch", path.name, worst)
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()
-        graphs[str(iterations)] = {"file": path.name, "sha256": digest}
-    entry = {
+    paths = {count: out / f"{config.name}_{count}.onnx" for count in config.iterations}
+    entry: dict[str, object] = {
         "stride": run.network.stride,
         "max_disparity_px": run.network.max_disparity_px,
         "state": [dataclasses.asdict(tensor) for tensor in network.state_tensors],
-        "graphs": graphs,
+    }
+    if isinstance(network, RaftNetwork):
+        shared = out / f"{config.name}.weights"
+        export_stitched(network, paths, shared)
+        entry["weights"] = named(shared)
+    else:
+        for count, path in paths.items():
+            export_part(whole_step(network, count), path)
+    for count, path in paths.items():
+        worst = check_parity(network, count, path)
+        log.info("%s: 99 %% of pixels within %.1e px of PyTorch", path.name, worst)
+    entry |= {
+        "graphs": {str(count): named(path) for count, path in paths.items()},
         "architecture": dataclasses.asdict(run.network),
         "parameters": sum(p.numel() for p in network.parameters()),
         "training": run.story,
         "measured": run.measured,
     }
     write_entry(out / MANIFEST_NAME, config.name, entry)
+
+
+def export_stitched(network: RaftNetwork, paths: Mapping[int, Path], weights: Path) -> None:
+    """Write a graph per iteration count to ``paths``, all beside one file of ``weights``."""
+    parts = []
+    with TemporaryDirectory() as folder:
+        for part in parts_of(folded(network)):
+            path = Path(folder) / "part.onnx"
+            export_part(part, path)
+            parts.append(onnx.load(path))
+    models = {path: stitched(Parts(*parts), count) for count, path in paths.items()}
+    write_with_shared_weights(models, weights)
+
+
+def named(path: Path) -> dict[str, str]:
+    """A file as the manifest names it."""
+    return {"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
 
 
 def write_entry(path: Path, name: str, entry: dict[str, object]) -> None:

@@ -133,6 +133,13 @@ def enlarge(x: Tensor) -> Tensor:
     return F.interpolate(x, scale_factor=2.0, mode="nearest")
 
 
+def standardized(x: Tensor) -> Tensor:
+    """Instance norm: every channel of every image to mean 0 and variance 1, [B, C, H, W]."""
+    x = x.float()
+    centred = x - x.mean(dim=(2, 3), keepdim=True)
+    return centred * torch.rsqrt(centred.square().mean(dim=(2, 3), keepdim=True) + 1e-5)
+
+
 def shares(scores: Tensor, dim: int) -> Tensor:
     """Softmax as exp and sum: the operator is twenty times slower off the last axis."""
     weights = torch.exp(scores - scores.amax(dim=dim, keepdim=True))

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 
@@ -21,13 +24,28 @@ def known(truth_px: Tensor, max_disparity_px: int) -> Tensor:
     return ((truth_px > 0) & (truth_px < max_disparity_px)).to(truth_px.dtype)
 
 
-def laplace_nll(error_px: Tensor, sigma_px: Tensor) -> Tensor:
-    """Negative log-likelihood of an error under a Laplace distribution of scale sigma.
+def lookup_cross_entropy(scores: Tensor, position: Tensor, mask: Tensor) -> Tensor:
+    """Cross-entropy of ``scores`` [B, H, W, N] with right answers ``position`` [B, H, W, K].
 
-    An error past 20 sigma pulls no harder: one outlier must not drown a batch.
+    A position between two entries votes for both. ``mask``, of its shape, is 1 where it counts.
     """
-    bounded = torch.minimum(error_px, 20 * sigma_px.detach())
-    return bounded / sigma_px + torch.log(sigma_px)
+    last = scores.shape[-1] - 1
+    position = position.clamp(0, last - 0.001)
+    low = torch.floor(position)
+    log_p = F.log_softmax(scores, dim=-1)
+    below, above = log_p.gather(3, low.long()), log_p.gather(3, low.long() + 1)
+    fraction = position - low
+    return masked_mean(-(below * (1 - fraction) + above * fraction), mask)
+
+
+def doubt_loss(error_px: Tensor, sigma_px: Tensor) -> Tensor:
+    """Least where half of the errors lie within sigma ln 2, as with a Laplace distribution.
+
+    A difference of logarithms, so that it is the median that counts: the likelihood would let the
+    few wild errors widen the sigma of everything around them.
+    """
+    floor_px = 0.02
+    return (torch.log(error_px + floor_px) - torch.log(sigma_px * math.log(2) + floor_px)).abs()
 
 
 def output_loss(
@@ -37,5 +55,5 @@ def output_loss(
     mask = known(truth_px, max_disparity_px)
     error = (disparity - truth_px).abs()
     # Sigma learns from the error, and must not buy itself a better one.
-    doubt = laplace_nll(error.detach(), sigma)
+    doubt = doubt_loss(error.detach(), sigma)
     return masked_mean(robust(error), mask) + 0.1 * masked_mean(doubt, mask)

@@ -28,7 +28,7 @@ class Estimate(ABC):
     """What one step answers; a tier adds the inner estimates that its training supervises too."""
 
     disparity: Tensor  # float32 [B, H, W], px > 0
-    sigma: Tensor  # float32 [B, H, W], px: scale of a Laplace distribution, the expected error
+    sigma: Tensor  # float32 [B, H, W], px: half of the errors lie within sigma ln 2
 
     @abstractmethod
     def loss(self, truth_px: Tensor, max_disparity_px: int) -> Tensor:

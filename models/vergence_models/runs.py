@@ -2,13 +2,15 @@
 
 ``checkpoint.pt`` holds all that going on needs (weights, their moving average, the optimizer, the
 random states, how far it came); it is replaced in one rename, so a kill leaves the old one whole.
-``log.jsonl`` has a line for every report. Both stay small enough to keep.
+Those of large networks leave the large tensors to pieces beside it: ``average-*`` is enough to
+export, ``weights-*`` and ``optimizer-*`` to go on. ``log.jsonl`` has a line for every report.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,9 +19,11 @@ import torch
 from torch import Tensor
 
 from vergence_models.config import Config, ConfigError, NetworkConfig, network_from_dict
+from vergence_models.pieces import HALF, PIECE_BYTES, joined, split, tensors_of
 
 CHECKPOINT_NAME = "checkpoint.pt"
-CHECKPOINT_FORMAT = 1
+WHOLE_FORMAT = 1  # everything in one file
+PIECES_FORMAT = 2  # an index, and the large tensors beside it
 
 
 class RunError(ValueError):
@@ -46,26 +50,66 @@ class Run:
     measured: dict[str, Any]  # any JSON: the last validation
 
 
-def save_checkpoint(path: Path, contents: dict[str, Any]) -> None:
-    """Replace the checkpoint at ``path`` atomically. ``contents`` is what torch.save takes."""
+def save_checkpoint(folder: Path, contents: dict[str, Any]) -> None:
+    """Replace a run's checkpoint. ``contents`` is what torch.save takes, with its ``progress``."""
+    if sum(tensor.nbytes for tensor in tensors_of(contents)) < PIECE_BYTES:
+        save(folder / CHECKPOINT_NAME, {"format": WHOLE_FORMAT, **contents})
+        return
+    index = {"format": PIECES_FORMAT, **contents}
+    names: dict[str, list[str]] = {}
+    for part, half in HALF.items():
+        index[part], pieces = split(contents[part], half)
+        # New names for new pieces: the old ones stay valid until the index is replaced.
+        steps = contents["progress"]["steps"]
+        names[part] = [f"{part}-{steps:08d}-{number}.pt" for number in range(len(pieces))]
+        for name, piece in zip(names[part], pieces, strict=True):
+            save(folder / name, piece)
+    save(folder / CHECKPOINT_NAME, {**index, "pieces": names})
+    kept = {name for part in names.values() for name in part}
+    for part in HALF:
+        for path in folder.glob(f"{part}-????????-*.pt"):
+            if path.name not in kept:
+                path.unlink()
+
+
+def save(path: Path, contents: dict[str, Any]) -> None:
+    """Write a file that is whole or not there."""
     partial = path.with_suffix(".partial")
-    torch.save({"format": CHECKPOINT_FORMAT, **contents}, partial)
+    torch.save(contents, partial)
     os.replace(partial, path)
 
 
-def load_checkpoint(folder: Path) -> dict[str, Any]:
-    """The contents of a run's checkpoint. Raises RunError naming the file and what was expected."""
+def load_checkpoint(folder: Path, parts: Collection[str] = HALF) -> dict[str, Any]:
+    """The contents of a run's checkpoint; of large ``parts`` only those asked for are read.
+
+    Raises RunError naming the file and what was expected.
+    """
     path = folder / CHECKPOINT_NAME
     if not path.is_file():
         raise RunError(f"no checkpoint at {path}; expected the folder of a training run")
+    contents = load(path)
+    if contents.get("format") == WHOLE_FORMAT:
+        return contents
+    if contents.get("format") != PIECES_FORMAT:
+        raise RunError(
+            f"{path}: expected checkpoint format {WHOLE_FORMAT} or {PIECES_FORMAT}, "
+            f"got {contents.get('format')}"
+        )
+    for part in parts:
+        tensors: dict[str, Tensor] = {}
+        for name in contents["pieces"][part]:
+            if not (folder / name).is_file():
+                raise RunError(f"no {folder / name}; {path} expects it beside itself")
+            tensors.update(load(folder / name))
+        contents[part] = joined(contents[part], tensors)
+    return contents
+
+
+def load(path: Path) -> dict[str, Any]:
     try:
         contents: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch.load raises a dozen unrelated types on a damaged file
         raise RunError(f"{path}: expected a checkpoint, could not read it: {error}") from error
-    if contents.get("format") != CHECKPOINT_FORMAT:
-        raise RunError(
-            f"{path}: expected checkpoint format {CHECKPOINT_FORMAT}, got {contents.get('format')}"
-        )
     return contents
 
 
@@ -87,7 +131,7 @@ def require_same_network(contents: dict[str, Any], config: Config, path: Path) -
 
 def read_run(folder: Path) -> Run:
     """Load a run for export or evaluation. Raises RunError."""
-    contents = load_checkpoint(folder)
+    contents = load_checkpoint(folder, parts=["average"])
     return Run(
         config_name=contents["config"],
         network=network_from_dict(

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import TypeAlias
 
-from vergence_models.config import ConfigError, LiteNetworkConfig, NetworkConfig
+from vergence_models.config import ConfigError, LiteNetworkConfig, NetworkConfig, RaftNetworkConfig
 from vergence_models.lite.network import LiteNetwork
 from vergence_models.network import StereoNetwork
+from vergence_models.raft.network import RaftNetwork
 
 # Callers need no more than the fields that all configurations share.
 AnyNetwork: TypeAlias = StereoNetwork[NetworkConfig]
@@ -17,5 +18,7 @@ def build_network(config: NetworkConfig) -> AnyNetwork:
     match config:
         case LiteNetworkConfig():
             return LiteNetwork(config)
+        case RaftNetworkConfig():
+            return RaftNetwork(config)
         case _:
             raise ConfigError(f"no architecture for a {type(config).__name__}")

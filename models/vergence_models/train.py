@@ -26,11 +26,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vergence_models.augment import stretched
-from vergence_models.config import CONFIGS, Config, load_config
+from vergence_models.augment import filmed, stretched
+from vergence_models.config import CONFIGS, Config, Precision, load_config
 from vergence_models.data.clips import StereoClips
 from vergence_models.data.pool import ClipPool
-from vergence_models.data.sensor import film_as_sensor
 from vergence_models.motion import perturbed, uvd_transforms
 from vergence_models.runs import (
     CHECKPOINT_NAME,
@@ -61,6 +60,8 @@ class Trainer:
         self.config = config
         self.device = device
         self.network = build_network(config.network).to(device)
+        if config.training.precision is Precision.BF16:  # the layout of the kernels for it
+            self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(),
@@ -82,7 +83,7 @@ class Trainer:
             "seed": training.seed,
         }
         save_checkpoint(
-            folder / CHECKPOINT_NAME,
+            folder,
             {
                 "config": self.config.name,
                 "network": dataclasses.asdict(self.config.network),
@@ -107,6 +108,11 @@ class Trainer:
         self.progress = Progress(**contents["progress"])
         self.measured = contents["measured"]
         self.commands = contents["story"]["commands"]
+
+    def autocast(self) -> torch.autocast:
+        """Convolutions and matrix products in the precision that was asked for."""
+        wanted = self.config.training.precision is Precision.BF16
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=wanted)
 
     def chance(self, share: float) -> bool:
         return bool(self.random.random() < share)
@@ -138,11 +144,15 @@ class Trainer:
             reset = frame == 0 or self.chance(training.reset_share)
             if reset:
                 state = cold
-            iterations = int(self.random.integers(1, 5)) if reset else 1 + int(self.chance(0.2))
+            most = training.cold_iterations
+            iterations = (
+                int(self.random.integers(1, most + 1)) if reset else 1 + int(self.chance(0.2))
+            )
             left, right = (
                 eye[:, frame].permute(0, 2, 3, 1).contiguous() for eye in (clips.left, clips.right)
             )
-            estimate, state = network(left, right, matrices[:, frame], state, iterations)
+            with self.autocast():
+                estimate, state = network(left, right, matrices[:, frame], state, iterations)
             truth = clips.disparity_px[:, frame]
             loss = loss + estimate.loss(truth, self.config.network.max_disparity_px) / frames
             errors.append((estimate.disparity.detach() - truth).abs()[truth > 0].mean().item())
@@ -154,7 +164,10 @@ class Trainer:
         # A young average follows quickly, an old one slowly.
         decay = min(training.ema_decay, (1 + self.progress.steps) / (10 + self.progress.steps))
         for name, value in network.state_dict().items():
-            self.average[name].lerp_(value, 1 - decay)
+            if value.is_floating_point():
+                self.average[name].lerp_(value, 1 - decay)
+            else:  # a count of batches
+                self.average[name].copy_(value)
         self.progress.steps += 1
         self.progress.frames += batch * frames
         return {
@@ -196,7 +209,7 @@ def train(trainer: Trainer, arguments: argparse.Namespace) -> None:
             trainer.random, training.batch, frames=training.frames, reverse=0.5, skip=0.3, flip=0.3
         )
         clips = stretched(clips, trainer.random, share=training.stretch_share)
-        recent.append(trainer.step(film_as_sensor(clips, trainer.random)))
+        recent.append(trainer.step(filmed(clips, trainer.random, clean_share=training.clean_share)))
         now = time.monotonic()
         trainer.progress.minutes += (now - last) / 60
         last = now

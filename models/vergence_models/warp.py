@@ -6,11 +6,14 @@ pixel centres at integers. A 4x4 matrix takes the previous frame's to the curren
 
 from __future__ import annotations
 
+import itertools
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 MIN_DISPARITY_PX = 0.05  # smaller ones are no surface a stereo camera can place
+SPLAT_SHARPNESS = 1.0  # 1/px: a surface nearer by 3 px has 20 times the weight
 
 
 def cell_centres(height: int, width: int, scale: int, like: Tensor) -> tuple[Tensor, Tensor]:
@@ -92,6 +95,68 @@ def sample_bilinear(features: Tensor, column: Tensor, row: Tensor) -> Tensor:
     low = sample_nearest(features, x0, y0 + 1) * (1 - fx)
     low = low + sample_nearest(features, x0 + 1, y0 + 1) * fx
     return top * (1 - fy) + low * fy
+
+
+def splat_softmax(values: Tensor, column: Tensor, row: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
+    """Forward-warp ``values`` [B, C, H, W] to float cells ``column``, ``row`` [B, H, W].
+
+    Each value is shared bilinearly among the four cells round where it lands. Where several
+    meet, they are averaged with weights that grow exponentially with their disparity ``d`` px
+    [B, H, W]: the nearest surface wins (softmax splatting, Niklaus and Liu, CVPR 2020). Values
+    without a disparity land nowhere. Returns the warped values, 0 where nothing lands, and where
+    something does, [B, 1, H, W].
+    """
+    batch, channels, height, width = values.shape
+    left, top = torch.floor(column), torch.floor(row)
+    cells, parts = [], []
+    for dy, dx in itertools.product((0, 1), repeat=2):
+        x, y = left + dx, top + dy
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height) & (d > MIN_DISPARITY_PX)
+        part = (1 - (column - x).abs()) * (1 - (row - y).abs())
+        cells.append((y.clamp(0, height - 1) * width + x.clamp(0, width - 1)).flatten(1))
+        parts.append((part * inside.to(d.dtype)).flatten(1))
+    cell, part = torch.cat(cells, dim=1).long(), torch.cat(parts, dim=1)
+    d = d.flatten(1).repeat(1, 4)
+    # As in any softmax the largest is subtracted, here of those that land mostly in this cell.
+    mostly = torch.where(part >= 0.25, d, torch.zeros_like(d))
+    nothing = torch.zeros_like(mostly[:, : height * width])
+    nearest = nothing.scatter_reduce(1, cell, mostly, "amax")
+    weight = part * torch.exp((d - nearest.gather(1, cell)).clamp(max=0) * SPLAT_SHARPNESS)
+    # One scatter of rows: a cell's channels lie side by side.
+    rows = torch.cat((values.flatten(2), torch.ones_like(values[:, :1]).flatten(2)), dim=1)
+    rows = rows.transpose(1, 2).repeat(1, 4, 1) * weight[:, :, None]
+    first = torch.arange(batch, device=d.device)[:, None] * (height * width)
+    canvas = torch.zeros_like(rows[:, : height * width]).reshape(-1, channels + 1)
+    index = ((cell + first).flatten(),)
+    landed = canvas.index_put(index, rows.reshape(-1, channels + 1), accumulate=True)
+    landed = landed.view(batch, height * width, channels + 1).transpose(1, 2)
+    mass = landed[:, channels:]
+    seen = (mass > 0.2).to(values.dtype)
+    warped = landed[:, :channels] / mass.clamp(min=0.2) * seen
+    return warped.reshape(values.shape), seen.reshape(batch, 1, height, width)
+
+
+def splat_levels(
+    disparity: Tensor, levels: tuple[Tensor, ...], uvd_curr_from_prev: Tensor, *, scale: int
+) -> list[tuple[Tensor, Tensor]]:
+    """Take disparity and features of ever coarser cells to the current view by softmax splatting.
+
+    ``disparity`` [B, 1, H/s, W/s] px at full resolution, 0 = nothing; ``levels`` [B, C, h, w] of
+    cells of s, 2 s, 4 s, ... pixels. Returns each with its mask, as :func:`splat_softmax`: the
+    moved disparity first. Geometry passes no gradient, values do.
+    """
+    warped = []
+    for level, values in enumerate((disparity, *levels)):
+        step = 2 ** max(level - 1, 0)
+        cell = scale * step
+        d = F.max_pool2d(disparity.detach(), step)[:, 0]
+        u, v = cell_centres(d.shape[1], d.shape[2], cell, d)
+        u_to, v_to, d_to = transform_uvd(uvd_curr_from_prev, u, v, d)
+        d_to = d_to * (d > MIN_DISPARITY_PX).to(d.dtype)
+        column, row = (u_to + 0.5) / cell - 0.5, (v_to + 0.5) / cell - 0.5
+        moved = d_to[:, None] if level == 0 else values
+        warped.append(splat_softmax(moved, column, row, d_to))
+    return warped
 
 
 def warp_state(

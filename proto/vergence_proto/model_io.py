@@ -116,22 +116,27 @@ def load_model_card(weights_dir: Path, name: str) -> ModelCard:
         )
     models = manifest["models"]
     if name not in models:
-        raise ManifestError(f"{path} has no model {name!r}; it has {', '.join(sorted(models))}")
+        raise ManifestError(
+            f"{path} has no model {name!r}; it has {', '.join(sorted(models))}. "
+            "Name the folder that another was exported to"
+        )
     entry = models[name]
     graphs = {int(count): weights_dir / graph["file"] for count, graph in entry["graphs"].items()}
     digests = {
         count: _checked_digest(path, entry["graphs"][str(count)]["sha256"])
         for count, path in graphs.items()
     }
+    # Large networks keep what their graphs have in common in one file beside them.
+    shared = [entry["weights"]] if "weights" in entry else []
+    hashes = [digests[count] for count in sorted(digests)]
+    hashes += [_checked_digest(weights_dir / each["file"], each["sha256"]) for each in shared]
     return ModelCard(
         name=name,
         stride=entry["stride"],
         max_disparity_px=entry["max_disparity_px"],
         state=tuple(StateTensor(**tensor) for tensor in entry["state"]),
         graphs=graphs,
-        weights_sha256=hashlib.sha256(
-            b"".join(digests[count] for count in sorted(digests))
-        ).hexdigest(),
+        weights_sha256=hashlib.sha256(b"".join(hashes)).hexdigest(),
     )
 
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from vergence_models.config import LiteNetworkConfig
 from vergence_models.evaluate import WEIGHTS
-from vergence_models.export import PARITY_PX, check_parity, export_graph, shifted_pair
+from vergence_models.export import PARITY_PX, check_parity, shifted_pair
+from vergence_models.graphs import export_part, whole_step
 from vergence_models.layers import all_pairs, banded, best_rival, lookup, lookup_row
 from vergence_models.lite.network import LiteNetwork, LiteState
 from vergence_models.stepping import OnnxNetwork
@@ -55,7 +56,7 @@ def test_the_graph_equals_pytorch_frame_by_frame(
     # Under pytest's capture the tracer would format every symbolic shape it meets: minutes of it.
     monkeypatch.setattr(logging.getLogger("torch.__trace"), "propagate", False)
     path = tmp_path / "lite_2.onnx"
-    export_graph(network, 2, path)
+    export_part(whole_step(network, 2), path)
     assert check_parity(network, 2, path, frames=4) < PARITY_PX
 
 

@@ -11,7 +11,9 @@ from vergence_models.warp import (
     cell_centres,
     fill_cracks,
     inverse_4x4,
+    splat_levels,
     splat_nearest,
+    splat_softmax,
     transform_uvd,
     warp_state,
 )
@@ -76,6 +78,51 @@ def test_true_pose_and_disparity_reproduce_the_next_view(name: str) -> None:
     known = inside & (hidden[:, 0] > 0)
     assert known.float().mean() > 0.6
     assert (hidden[:, 0] - expected).abs()[known].mean() < 0.05
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_splatting_by_softmax_reproduces_the_next_view_too(name: str) -> None:
+    world_from_curr = pose(*MOTIONS[name])
+    matrix = torch.from_numpy(uvd_curr_from_prev(RIG, world_from_curr.inverse()))[None]
+    before = wall_disparity(Pose.identity(), 8)[:, None]
+    columns = [
+        torch.arange(WIDTH // scale).float().expand(1, 1, HEIGHT // scale, WIDTH // scale)
+        for scale in (8, 16)
+    ]
+    (prior, seen), *hidden = splat_levels(before, tuple(columns), matrix, scale=8)
+    inner = torch.zeros_like(seen, dtype=torch.bool)
+    inner[..., 2:-2, 2:-2] = seen[..., 2:-2, 2:-2] > 0
+    assert inner.float().mean() > 0.6
+    # Four cells of 8 px share each value: a slanted wall is smoothed by their spread.
+    error = (prior - wall_disparity(world_from_curr, 8)[:, None]).abs()[inner]
+    assert error.mean() < 0.05
+    assert error.quantile(0.99) < 0.2
+
+    back = torch.linalg.inv(matrix.double()).float()
+    for scale, (values, known) in zip((8, 16), hidden, strict=True):
+        u, v = cell_centres(*values.shape[2:], scale, values)
+        u_from, _, _ = transform_uvd(back, u, v, wall_disparity(world_from_curr, scale))
+        expected = (u_from + 0.5) / scale - 0.5
+        inside = (known[:, 0] > 0) & (expected > 1) & (expected < values.shape[3] - 2)
+        assert inside.float().mean() > 0.5
+        assert (values[:, 0] - expected).abs()[inside].mean() < 0.1
+
+
+def test_a_still_camera_splats_everything_where_it_was() -> None:
+    before = wall_disparity(Pose.identity(), 8)[:, None]
+    hidden = torch.randn(1, 5, *before.shape[2:]), torch.randn(1, 3, 12, 16)
+    warped = splat_levels(before, hidden, torch.eye(4)[None], scale=8)
+    for (values, seen), expected in zip(warped, (before, *hidden), strict=True):
+        assert torch.allclose(values, expected, atol=1e-4)
+        assert (seen == 1).all()
+
+
+def test_the_nearest_wins_by_softmax_and_far_surfaces_are_not_lost() -> None:
+    d = torch.tensor([[[5.0, 30.0, 6.0, 0.0]]])
+    column = torch.tensor([[[1.0, 1.0, 3.0, 0.0]]])
+    values, seen = splat_softmax(d[:, None], column, torch.zeros_like(column), d)
+    assert values.flatten().tolist() == pytest.approx([0.0, 30.0, 0.0, 6.0], abs=1e-4)
+    assert seen.flatten().tolist() == [0, 1, 0, 1]
 
 
 def test_where_two_surfaces_land_the_nearest_wins() -> None:

@@ -1,0 +1,128 @@
+"""From modules to ONNX graphs: a whole step at once, or parts of it to be stitched."""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import onnx
+import torch
+from torch import Tensor, nn
+from torch.nn.utils import fuse_conv_bn_eval
+
+from vergence_models.tiers import AnyNetwork
+from vergence_proto.model_io import DISPARITY, LEFT, RIGHT, SIGMA, UVD_CURR_FROM_PREV
+
+OPSET = 18  # ScatterElements gained reduction="max" there
+BATCH = torch.export.Dim("batch", min=1, max=256)
+ROWS = torch.export.Dim("rows", min=1, max=128)
+COLUMNS = torch.export.Dim("columns", min=1, max=128)
+
+# What the exporter takes for a tensor's dynamic sizes: dimension -> a Dim or a multiple of one.
+Sizes = dict[int, object]
+Network = TypeVar("Network", bound=nn.Module)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """A module to export, and what goes in and out of it: tensors alone, by name."""
+
+    module: nn.Module
+    inputs: tuple[Tensor, ...]  # examples
+    sizes: tuple[Sizes, ...]  # of the inputs
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+
+
+def cells(stride: int, scale: int) -> Sizes:
+    """Sizes of [B, C, H / scale, W / scale] for images that are multiples of ``stride``."""
+    return {0: BATCH, 2: stride // scale * ROWS, 3: stride // scale * COLUMNS}
+
+
+def step_inputs(network: AnyNetwork) -> tuple[tuple[Tensor, ...], tuple[Sizes, ...]]:
+    """Examples of the contract's inputs, and how their sizes vary."""
+    stride = network.config.stride
+    height, width = 6 * stride, 8 * stride
+    # Two tensors: the exporter would take one object for one input, and match left with left.
+    left, right = (torch.zeros(2, height, width, 3, dtype=torch.uint8) for _ in range(2))
+    state = network.cold_state(2, height, width)
+    image: Sizes = {0: BATCH, 1: stride * ROWS, 2: stride * COLUMNS}
+    state_sizes = (cells(stride, tensor.scale) for tensor in network.state_tensors)
+    return (
+        (left, right, torch.eye(4).repeat(2, 1, 1), *state),
+        (image, image, {0: BATCH}, *state_sizes),
+    )
+
+
+def step_input_names(network: AnyNetwork) -> tuple[str, ...]:
+    return (LEFT, RIGHT, UVD_CURR_FROM_PREV, *(t.input_name for t in network.state_tensors))
+
+
+def step_output_names(network: AnyNetwork) -> tuple[str, ...]:
+    return (DISPARITY, SIGMA, *(tensor.output_name for tensor in network.state_tensors))
+
+
+class WholeStep(nn.Module):
+    """The step with flat tensors in and out, in the order of the contract."""
+
+    def __init__(self, network: AnyNetwork, iterations: int) -> None:
+        super().__init__()
+        self.network = network
+        self.iterations = iterations
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        left, right, matrix, *state = inputs
+        estimate, following = self.network(left, right, matrix, tuple(state), self.iterations)
+        return estimate.disparity, estimate.sigma, *following
+
+
+def whole_step(network: AnyNetwork, iterations: int) -> Part:
+    inputs, sizes = step_inputs(network)
+    names = step_input_names(network), step_output_names(network)
+    return Part(WholeStep(network, iterations), inputs, sizes, *names)
+
+
+def export_part(part: Part, path: Path) -> None:
+    """Write a part's graph, with dynamic batch, height and width."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the exporter's own deprecations
+        torch.onnx.export(
+            part.module,
+            part.inputs,
+            str(path),
+            dynamo=True,
+            verbose=False,
+            external_data=False,
+            opset_version=OPSET,
+            dynamic_shapes=(part.sizes,),  # of the one variadic argument
+            input_names=part.input_names,
+            output_names=part.output_names,
+        )
+    slim(path)
+
+
+def slim(path: Path) -> None:
+    """Drop what the exporter notes about the author's machine (stack traces, file paths)."""
+    model = onnx.load(path)
+    for node in model.graph.node:
+        del node.metadata_props[:]
+    del model.graph.value_info[:]
+    del model.metadata_props[:]
+    onnx.save(model, path)
+
+
+def folded(network: Network) -> Network:
+    """A copy that computes the same with every batch norm folded into its convolution."""
+    network = copy.deepcopy(network).eval()
+    for module in network.modules():
+        if not isinstance(module, nn.Sequential):
+            continue
+        for place in range(len(module) - 1):
+            layer, norm = module[place], module[place + 1]
+            if isinstance(layer, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
+                module[place] = fuse_conv_bn_eval(layer, norm)
+                module[place + 1] = nn.Identity()
+    return network

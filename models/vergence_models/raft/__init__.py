@@ -1,0 +1,1 @@
+"""The `full` and `fast` tiers: RAFT-Stereo's realtime network, carried through time by a warp."""

@@ -1,0 +1,133 @@
+"""Laws of `full` and `fast`: of their steps, their graphs, and where their state comes from."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import onnx
+import pytest
+import torch
+
+from vergence_models.config import RaftNetworkConfig
+from vergence_models.export import PARITY_PX, check_parity, export_stitched, shifted_pair
+from vergence_models.graphs import folded
+from vergence_models.raft.network import RaftNetwork, RaftState
+from vergence_models.raft.update import looked_up, pyramid
+
+HEIGHT, WIDTH = 96, 224
+TINY = {
+    "encoder_half": 8,
+    "encoder_quarter": 8,
+    "encoder_eighth": 16,
+    "features": 16,
+    "hidden": 16,
+    "motion": 8,
+    "head": 16,
+}
+
+
+def tiny_network(*, warp: bool = True) -> RaftNetwork:
+    """As training might have left it: no weight of a head is zero, no norm is the identity."""
+    torch.manual_seed(5)
+    network = RaftNetwork(RaftNetworkConfig(warp=warp, **TINY))
+    with torch.no_grad():
+        for parameter in network.parameters():
+            if parameter.dim() == 4 and not parameter.any():
+                parameter.normal_(0, 0.02)
+        for module in network.modules():
+            if isinstance(module, torch.nn.BatchNorm2d):
+                for statistic in (module.running_mean, module.running_var):
+                    assert statistic is not None
+                    statistic.uniform_(0.5, 1.5)
+    return network.eval()
+
+
+def views(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
+    left, right = shifted_pair(HEIGHT, WIDTH, seed)
+    return torch.from_numpy(left), torch.from_numpy(right)
+
+
+@pytest.fixture
+def quiet(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Under pytest's capture the tracer would format every symbolic shape it meets: minutes of it.
+    monkeypatch.setattr(logging.getLogger("torch.__trace"), "propagate", False)
+
+
+@pytest.mark.usefixtures("quiet")
+@pytest.mark.parametrize("warp", [True, False], ids=["full", "fast"])
+def test_stitched_graphs_equal_pytorch_frame_by_frame(warp: bool, tmp_path: Path) -> None:
+    network = tiny_network(warp=warp)
+    paths = {count: tmp_path / f"tiny_{count}.onnx" for count in (1, 3)}
+    weights = tmp_path / "tiny.weights"
+    export_stitched(network, paths, weights)
+    for count, path in paths.items():
+        assert check_parity(network, count, path, frames=4) < PARITY_PX
+        kinds = {node.op_type for node in onnx.load(path, load_external_data=False).graph.node}
+        assert not kinds & {"BatchNormalization", "Loop", "If"}
+        # More iterations are more of the same nodes, not more weights.
+        assert path.stat().st_size < weights.stat().st_size
+    stored = sum(p.numel() * 4 for p in folded(network).parameters())
+    assert weights.stat().st_size < 2 * stored
+
+
+def test_folding_batch_norms_changes_no_result() -> None:
+    network = tiny_network()
+    state = network.cold_state(1, HEIGHT, WIDTH)
+    with torch.inference_mode():
+        expected, _ = network(*views(0), torch.eye(4)[None], state, 2)
+        got, _ = folded(network)(*views(0), torch.eye(4)[None], state, 2)
+    assert not any(isinstance(m, torch.nn.BatchNorm2d) for m in folded(network).modules())
+    assert torch.allclose(got.disparity, expected.disparity, atol=1e-3)
+
+
+def test_rows_of_a_batch_are_independent() -> None:
+    network = tiny_network()
+    a, b = views(1), views(2)
+    state = RaftState(
+        torch.rand(2, 1, HEIGHT // 8, WIDTH // 8) * 30,
+        torch.randn(2, 16, HEIGHT // 8, WIDTH // 8),
+        torch.randn(2, 16, HEIGHT // 16, WIDTH // 16),
+    )
+    matrix = torch.eye(4).repeat(2, 1, 1)
+    matrix[1, 0, 3] = 3.0
+    with torch.inference_mode():
+        both, _ = network(torch.cat((a[0], b[0])), torch.cat((a[1], b[1])), matrix, state, 1)
+        alone, _ = network(*b, matrix[1:], tuple(tensor[1:] for tensor in state), 1)
+    # PyTorch picks its convolution by batch size, so not to the bit.
+    assert (both.disparity[1] - alone.disparity[0]).abs().mean() < 1e-3
+
+
+def test_a_warm_step_goes_on_where_the_last_one_ended() -> None:
+    """With a still camera, two steps of one iteration are one step of two."""
+    network = tiny_network()
+    left, right = views(3)
+    still, state = torch.eye(4)[None], network.cold_state(1, HEIGHT, WIDTH)
+    with torch.inference_mode():
+        _, state = network(left, right, still, state, 1)
+        twice, _ = network(left, right, still, state, 1)
+        at_once, _ = network(left, right, still, network.cold_state(1, HEIGHT, WIDTH), 2)
+    assert torch.allclose(twice.disparity, at_once.disparity, atol=1e-2)
+
+
+def test_without_a_warp_the_motion_is_not_heard() -> None:
+    network = tiny_network(warp=False)
+    _, state = network(*views(4), torch.eye(4)[None], network.cold_state(1, HEIGHT, WIDTH), 1)
+    moved = torch.eye(4)[None].clone()
+    moved[0, 0, 3] = 9.0
+    still_seen, moved_seen = (
+        network(*views(4), matrix, state, 1)[0].disparity for matrix in (torch.eye(4)[None], moved)
+    )
+    assert torch.equal(still_seen, moved_seen)
+
+
+def test_the_lookup_of_every_level_is_centred_on_the_match() -> None:
+    columns = 32
+    pairs = (torch.arange(columns) == 12).float().expand(1, 1, columns, columns)
+    d = (torch.arange(columns) - 12.0).view(1, 1, 1, columns) * 8  # all look at column 12
+    found = looked_up(pyramid(pairs), d)[0, :, 0, 20].view(4, 9)
+    assert found[0].tolist() == [0, 0, 0, 0, 1, 0, 0, 0, 0]
+    for level in (1, 2, 3):
+        # An average over 2^k cells, interpolated between two such averages round the match.
+        assert found[level, 3:6].sum() == pytest.approx(1 / 2**level)
+        assert found[level, :3].sum() == found[level, 6:].sum() == 0
