@@ -75,21 +75,22 @@ class Bench:
 
 def step_times_ms(
     methods: Sequence[Method], *, rounds: int, width: int = 640, height: int = 480
-) -> dict[str, float]:
-    """Label -> median wall milliseconds of a frame that is not the first.
+) -> dict[str, tuple[float, float]]:
+    """Label -> median milliseconds of a frame that is not the first: wall, and CPU of all threads.
 
     The methods take turns, so that a busy moment of the machine hits all of them.
     """
     footage = textured_footage(width, height, rounds + 1)
     predictions = [(method.label, method.predict(footage)) for method in methods]
-    times: dict[str, list[float]] = {label: [] for label, _ in predictions}
+    times: dict[str, list[tuple[float, float]]] = {label: [] for label, _ in predictions}
     for turn in range(rounds + 1):
         for label, predicted in predictions:
-            start = time.perf_counter()
+            wall, cpu = time.perf_counter(), time.process_time()
             next(predicted)
             if turn:
-                times[label].append(1e3 * (time.perf_counter() - start))
-    return {label: float(np.median(spent)) for label, spent in times.items()}
+                times[label].append((time.perf_counter() - wall, time.process_time() - cpu))
+    medians = {label: 1e3 * np.median(spent, axis=0) for label, spent in times.items()}
+    return {label: (float(wall), float(cpu)) for label, (wall, cpu) in medians.items()}
 
 
 def textured_footage(width: int, height: int, frames: int) -> Footage:

@@ -51,16 +51,18 @@ def training_of(contenders: Sequence[Contender]) -> list[str]:
 def times(bench: Bench) -> Table:
     """What a frame costs."""
     found = step_times_ms(every_method(bench), rounds=bench.settings.timed)
+    rows = [
+        Row(label, {"ms": round(ms, 2), "fps": round(1e3 / ms, 3), "cpu_ms": round(cpu_ms, 2)})
+        for label, (ms, cpu_ms) in found.items()
+    ]
     return Table(
         name="times",
         title="Time of a frame",
-        text="Median wall time of a 640x480 frame, batch 1, on this machine's CPU; all methods "
-        "take turns in one run. Graphs run under onnxruntime, rows that say PyTorch under PyTorch.",
+        text="Medians for a 640x480 frame, batch 1, on this machine's CPU; all methods take turns "
+        "in one run, so what else the machine does hits all alike. CPU time counts every thread. "
+        "Graphs run under onnxruntime, rows that say PyTorch under PyTorch.",
         columns=TIME_COLUMNS,
-        rows=[
-            Row(label, {"ms": round(ms, 2), "fps": round(1e3 / ms, 3)})
-            for label, ms in found.items()
-        ],
+        rows=rows,
         training=[],
     )
 

@@ -12,7 +12,7 @@ from typing import Any
 FORMAT = 1
 
 EPE_COLUMNS = {"epe": "EPE", "d1": "D1 %", "d3": "D3 %", "d5": "D5 %"}
-TIME_COLUMNS = {"ms": "ms", "fps": "FPS"}  # joined from the table of times
+TIME_COLUMNS = {"ms": "ms", "fps": "FPS", "cpu_ms": "CPU ms"}  # joined from the table of times
 
 
 class StudyFileError(ValueError):
