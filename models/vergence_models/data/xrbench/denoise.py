@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from vergence_models.data.xrbench.tracer import Light, Planes
 
 _LEVELS = 5  # the last one reaches 16 pixels
-_DARKEST_ALBEDO = 0.02
+_FLOOR = 0.01  # added to the albedo, so that black can be divided by
 _EDGE = 0.35  # neighbours whose light differs by this factor (in logarithm) are told apart
+_LIKENESS = 6  # exponent of the cosine between normals: 0.1 for pixels half on either wall
 _DEPTH = 0.02  # relative step in depth that separates surfaces, a pixel
 _BRIGHTEST = 30.0  # of the median: single paths beyond it are fireflies
 
@@ -21,14 +22,16 @@ def denoised(light: Light, keep: NDArray[np.bool_] | None = None) -> Planes:
     (edge-avoiding a-trous, Dammertz et al. 2010): textures come from the noiseless albedo.
     """
     surface = light.depth_m > 0
-    albedo = np.where(surface & (light.albedo > _DARKEST_ALBEDO), light.albedo, 1)
+    albedo = np.where(surface, light.albedo + _FLOOR, 1)
     value = light.radiance / albedo
     brightness = value.mean(-1, keepdims=True)
     limit = _BRIGHTEST * np.median(brightness) + 1e-6
     value = value * np.minimum(1, limit / np.maximum(brightness, 1e-9))
     depth = np.where(surface, light.depth_m, 1e6)
+    length = np.linalg.norm(light.normals, axis=-1, keepdims=True)
+    normals = light.normals / np.maximum(length, 1e-6)
     for level in range(_LEVELS):
-        value = _smoothed(value, light.normals, depth, step=2**level, edges=level >= 2)
+        value = _smoothed(value, normals, depth, step=2**level, edges=level >= 2)
     result = value * albedo
     still = ~surface[..., 0] if keep is None else ~surface[..., 0] | keep
     result[still] = light.radiance[still]
@@ -47,7 +50,7 @@ def _smoothed(value: Planes, normals: Planes, depth: Planes, *, step: int, edges
             if (dx, dy) == (0, 0) or total[here].size == 0:
                 continue
             alike = np.einsum("hwk,hwk->hw", normals[here], normals[there])[..., None]
-            weight = np.clip(alike, 0, 1) ** 16 * (1.0 if dx and dy else 2.0)
+            weight = np.clip(alike, 0, 1) ** _LIKENESS * (1.0 if dx and dy else 2.0)
             apart = np.abs(depth[here] - depth[there]) / (depth[here] * _DEPTH * step)
             if logs is not None:
                 apart += np.abs(logs[here] - logs[there]) / _EDGE
