@@ -263,7 +263,11 @@ def kitti(bench: Bench, group: Group) -> Table:
 
 
 def rows_of(found: dict[str, Tally]) -> list[Row]:
-    return [Row(label, figures(tally)) for label, tally in found.items()]
+    """All figures but the times, which `times` measures on frames of one size."""
+    return [
+        Row(label, {k: v for k, v in figures(tally).items() if k not in ("cpu_ms", "wall_ms")})
+        for label, tally in found.items()
+    ]
 
 
 def epe(tally: Tally) -> float:
