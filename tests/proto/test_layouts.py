@@ -205,6 +205,27 @@ class TestSceneFlow:
         source = open_source(f"sceneflow:{folder}?fx=20")
         assert [each.frame.pose is None for each in source] == [False, True, True]
 
+    def test_intrinsics_beside_the_camera_data_need_no_option(self, tmp_path: Path) -> None:
+        folder = trees.sceneflow_sequence(tmp_path)
+        beside = tmp_path / "camera_data" / "TRAIN" / "A" / "0000" / "intrinsics.json"
+        beside.write_text('{"fx": 21.5, "fps": 20}')
+        source = open_source(f"sceneflow:{folder}")
+        assert (rig_of(source).fx, source.fps, source.metric) == (21.5, 20, True)
+        assert source[1].frame.capture_ns - source[0].frame.capture_ns == 50_000_000
+        assert rig_of(open_source(f"sceneflow:{folder}?fx=20")).fx == 20  # whoever asks, gets it
+
+    def test_mirrors_are_not_judged_where_the_data_tells_of_them(self, tmp_path: Path) -> None:
+        folder = trees.sceneflow_sequence(tmp_path)
+        specular = np.zeros((trees.HEIGHT, trees.WIDTH), np.uint8)
+        specular[3:5, 7:9] = 255
+        rest = Path("TRAIN") / "A" / "0000" / "left" / "0006.png"
+        trees.write_image(tmp_path / "specular" / rest, specular)
+        first, second, _ = open_source(f"sceneflow:{folder}?fx=20")
+        assert first.truth_mask is not None
+        np.testing.assert_array_equal(first.truth_mask, specular == 0)
+        assert second.truth_mask is not None
+        assert second.truth_mask.all()
+
 
 class TestTartanAir:
     @pytest.mark.parametrize("version", [1, 2])

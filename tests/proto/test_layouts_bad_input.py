@@ -267,6 +267,24 @@ def test_sceneflow_asks_for_a_focal_length_it_cannot_know(tmp_path: Path) -> Non
     assert f"add it: sceneflow:{folder}?fx=PIXELS" in said
 
 
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "not JSON"),
+        ("[]", "expected a JSON object, got list"),
+        ('{"fx": "wide"}', "expected a number for 'fx'"),
+        ('{"fx": 20, "fps": 0}', "expected a positive fps"),
+    ],
+)
+def test_sceneflow_names_intrinsics_it_cannot_use(text: str, message: str, tmp_path: Path) -> None:
+    folder = trees.sceneflow_sequence(tmp_path)
+    beside = tmp_path / "camera_data" / "TRAIN" / "A" / "0000" / "intrinsics.json"
+    beside.write_text(text)
+    said = opening(f"sceneflow:{folder}")
+    assert message in said
+    assert str(beside) in said
+
+
 def test_sceneflow_is_known_by_its_passes(tmp_path: Path) -> None:
     assert "expected a sequence under frames_cleanpass or frames_finalpass" in opening(
         f"sceneflow:{tmp_path}?fx=20"

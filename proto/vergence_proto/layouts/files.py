@@ -1,5 +1,6 @@
 """Small files read with care, and the one error of every reader."""
 
+import json
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -8,6 +9,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
+
+JsonObject = Mapping[str, object]
 
 
 class LayoutError(ValueError):
@@ -41,6 +44,25 @@ def numbers(words: str, count: int | None, origin: str) -> list[float]:
     if count is not None and len(parsed) != count:
         raise LayoutError(f"{origin}: expected {count} numbers, got {len(parsed)}")
     return parsed
+
+
+def read_object(path: Path, purpose: str) -> JsonObject:
+    """Raises LayoutError: there is no such file, or no JSON object in it."""
+    try:
+        read = json.loads(read_text(path, purpose))
+    except json.JSONDecodeError as error:
+        raise LayoutError(f"{path}: not JSON: {error}") from None
+    if not isinstance(read, dict):
+        raise LayoutError(f"{path}: expected a JSON object, got {type(read).__name__}")
+    return read
+
+
+def object_number(path: Path, read: JsonObject, key: str) -> float:
+    """Raises LayoutError: what :func:`read_object` read has no number under ``key``."""
+    value = read.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise LayoutError(f"{path}: expected a number for {key!r}, got {value!r}")
+    return float(value)
 
 
 def npz_arrays(path: Path, *names: str) -> Mapping[str, NDArray[Any]]:

@@ -1,7 +1,7 @@
 """SceneFlow (FlyingThings3D, Driving, Monkaa) and what was rendered in its format (XR-Stereo).
 
-``sceneflow:ROOT/frames_finalpass/TRAIN/A/0000``, with ``?fx=PIXELS`` for images that are not
-SceneFlow's own 960x540::
+``sceneflow:ROOT/frames_finalpass/TRAIN/A/0000``, with ``?fx=PIXELS`` for images that are neither
+SceneFlow's own 960x540 nor come with their intrinsics, as our benchmark's do::
 
     ROOT/frames_cleanpass|frames_finalpass/REST/left right   %04d.png or .webp
     ROOT/disparity/REST/left                                 %04d.pfm, positive pixels
@@ -18,7 +18,13 @@ from pathlib import Path
 import numpy as np
 
 from vergence_proto.geometry import Pose
-from vergence_proto.layouts.files import LayoutError, numbers, read_text
+from vergence_proto.layouts.files import (
+    LayoutError,
+    numbers,
+    object_number,
+    read_object,
+    read_text,
+)
 from vergence_proto.layouts.images import read_image, read_pfm
 from vergence_proto.layouts.poses import checked_pose
 from vergence_proto.layouts.source import (
@@ -48,7 +54,7 @@ def open_path(path: Path, *, fx: float | None = None) -> StereoSource:
 
     Frames that the camera data leaves out have no pose.
     """
-    disparity = _beside(path, "disparity") / "left"
+    disparity, specular = (_beside(path, kind) / "left" for kind in ("disparity", "specular"))
     origin = _beside(path, "camera_data") / "camera_data.txt"
     cameras = _read_cameras(origin)
     images = sorted(
@@ -60,6 +66,15 @@ def open_path(path: Path, *, fx: float | None = None) -> StereoSource:
         raise LayoutError(f"{path / 'left'}: expected images %04d.png or .webp, found none")
     height, width = read_image(images[0]).shape[:2]
     own = (width, height) == _OWN_SIZE
+    fps = None
+    intrinsics = origin.with_name("intrinsics.json")
+    if intrinsics.exists():
+        known = read_object(intrinsics, "fx and fps")
+        fx = fx or object_number(intrinsics, known, "fx")
+        fps = object_number(intrinsics, known, "fps")
+        if fps <= 0:
+            raise LayoutError(f"{intrinsics}: expected a positive fps, got {fps}")
+        own = False
     if fx is None and not own:
         raise LayoutError(
             f"{path}: images of {width}x{height} are not SceneFlow's own, and the layout states "
@@ -78,13 +93,15 @@ def open_path(path: Path, *, fx: float | None = None) -> StereoSource:
         FrameFiles(
             left,
             path / "right" / left.name,
-            nominal_ns(index, None),
+            nominal_ns(index, fps),
             cameras[int(left.stem)][0] if int(left.stem) in cameras else None,
-            partial(_truth, disparity / f"{left.stem}.pfm") if disparity.is_dir() else None,
+            partial(_truth, disparity / f"{left.stem}.pfm", specular / f"{left.stem}.png")
+            if disparity.is_dir()
+            else None,
         )
         for index, left in enumerate(images)
     ]
-    return StereoSource(path.name, rig, None, files, metric=not own)
+    return StereoSource(path.name, rig, fps, files, metric=not own)
 
 
 def _beside(path: Path, kind: str) -> Path:
@@ -120,7 +137,8 @@ def _pose(words: str, origin: str) -> Pose:
     return checked_pose(world_from_blender @ _OPENCV_FROM_BLENDER_CAMERA, origin)
 
 
-def _truth(path: Path) -> Truth:
+def _truth(path: Path, specular: Path) -> Truth:
     offset_px = read_pfm(path)
     offset_px[~(offset_px > 0)] = np.nan
-    return Truth(offset_px)
+    mask = read_image(specular)[..., 0] == 0 if specular.is_file() else None
+    return Truth(offset_px, mask)

@@ -17,7 +17,6 @@ Disparities are pixel offsets u_left - u_right. Null intrinsics mean unknown: a 
 wide as its focal length (53 degrees) with a baseline of 0.1 m, stands in for disparity's sake.
 """
 
-import json
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -25,7 +24,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vergence_proto.layouts.files import LayoutError, npz_arrays, read_text
+from vergence_proto.layouts.files import (
+    JsonObject,
+    LayoutError,
+    npz_arrays,
+    object_number,
+    read_object,
+)
 from vergence_proto.layouts.poses import read_matrix_poses
 from vergence_proto.layouts.source import (
     FrameFiles,
@@ -40,8 +45,6 @@ _EXTENSIONS = (".png", ".webp", ".jpg")
 _TRUTH_STEPS_PER_PX = np.float32(64)
 _NOMINAL_BASELINE_M = 0.1
 
-Calib = Mapping[str, object]
-
 
 def find(root: Path) -> list[Path]:
     """Every sequence and pair in or under ``root``."""
@@ -51,11 +54,11 @@ def find(root: Path) -> list[Path]:
 def open_path(path: Path) -> StereoSource:
     """Raises LayoutError: a file is missing or wrong; calibration and poses are read at once."""
     origin = path / "calib.json"
-    calib = _read_calib(origin)
+    calib = read_object(origin, "the calibration of a vergence: sequence or pair")
     rig, metric = _rig(origin, calib)
     if _image(path / "left"):
         return StereoSource(path.name, rig, None, [_pair(path)], metric)
-    fps = _number(origin, calib, "fps") if calib.get("fps") is not None else None
+    fps = object_number(origin, calib, "fps") if calib.get("fps") is not None else None
     if fps is not None and fps <= 0:
         raise LayoutError(f"{origin}: expected a positive fps, got {fps}")
     return StereoSource(path.name, rig, fps, _frames(path, rig, fps), metric)
@@ -77,31 +80,14 @@ def _image_or_raise(stem: Path) -> Path:
     return found
 
 
-def _read_calib(path: Path) -> Calib:
-    try:
-        calib = json.loads(read_text(path, "the calibration of a vergence: sequence or pair"))
-    except json.JSONDecodeError as error:
-        raise LayoutError(f"{path}: not JSON: {error}") from None
-    if not isinstance(calib, dict):
-        raise LayoutError(f"{path}: expected a JSON object, got {type(calib).__name__}")
-    return calib
-
-
-def _number(path: Path, calib: Calib, key: str) -> float:
-    value = calib.get(key)
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise LayoutError(f"{path}: expected a number for {key!r}, got {value!r}")
-    return float(value)
-
-
-def _rig(path: Path, calib: Calib) -> tuple[StereoRig, bool]:
-    width, height = (int(_number(path, calib, key)) for key in ("width", "height"))
+def _rig(path: Path, calib: JsonObject) -> tuple[StereoRig, bool]:
+    width, height = (int(object_number(path, calib, key)) for key in ("width", "height"))
     if calib.get("fx", 0) is None or calib.get("baseline_m", 0) is None:
         centre = (width - 1) / 2, (height - 1) / 2
         nominal = {"fx": width, "cx": centre[0], "cy": centre[1], "baseline_m": _NOMINAL_BASELINE_M}
         return rectified_rig(path, (width, height), **nominal), False
-    known = {key: _number(path, calib, key) for key in ("fx", "cx", "cy", "baseline_m")}
-    extra = {key: _number(path, calib, key) for key in ("fy", "cx_right") if key in calib}
+    known = {key: object_number(path, calib, key) for key in ("fx", "cx", "cy", "baseline_m")}
+    extra = {key: object_number(path, calib, key) for key in ("fy", "cx_right") if key in calib}
     return rectified_rig(path, (width, height), **known, **extra), True
 
 

@@ -20,7 +20,9 @@ _DEFAULTS = Recipe(KINDS[0])
 
 
 def main(
-    out: Annotated[Path | None, typer.Option(help="Folder of the data set; made if missing.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the data set; made if missing.")
+    ] = None,
     set_: Annotated[str | None, typer.Option("--set", help=f"One of {', '.join(SETS)}.")] = None,
     recipe: Annotated[
         list[Path] | None, typer.Option(help="A recipe's JSON, as recipes/ of a set holds them.")
@@ -38,7 +40,9 @@ def main(
     variant: Annotated[
         str | None, typer.Option(help=f"Of Mitsuba: {', '.join(VARIANTS)}; LLVM's if not given.")
     ] = None,
-    list_: Annotated[bool, typer.Option("--list", help="Tell what the sets hold, and stop.")] = False,
+    list_: Annotated[
+        bool, typer.Option("--list", help="Tell what the sets hold, and stop.")
+    ] = False,
 ) -> None:
     """Path-trace stereo sequences of indoor scenes with every ground truth.
 
@@ -73,18 +77,14 @@ def _chosen(
             raise BadRecipe(f"no set {set_!r}; there are {', '.join(SETS)}")
         return list(SETS[set_])
     if room is not None:
-        return [
-            Recipe(room, seed=seed, speed=speed, fps=fps, fov_deg=fov, baseline_m=baseline)
-        ]
+        return [Recipe(room, seed=seed, speed=speed, fps=fps, fov_deg=fov, baseline_m=baseline)]
     try:
         return [Recipe.from_json(path.read_text("utf-8"), path) for path in files]
     except OSError as error:
         raise BadRecipe(str(error)) from None
 
 
-def _adapted(
-    recipe: Recipe, frames: int | None, size: str | None, samples: int | None
-) -> Recipe:
+def _adapted(recipe: Recipe, frames: int | None, size: str | None, samples: int | None) -> Recipe:
     if frames is not None:
         recipe = dataclasses.replace(recipe, frames=frames)
     if samples is not None:

@@ -112,9 +112,7 @@ class StereoCamera:
 
         return FrameTruth(
             disparity_px=truths.disparity_px(depth, optics.focal_px, recipe.baseline_m),
-            right_disparity_px=truths.disparity_px(
-                right_depth, optics.focal_px, recipe.baseline_m
-            ),
+            right_disparity_px=truths.disparity_px(right_depth, optics.focal_px, recipe.baseline_m),
             depth_m=depth,
             into_future=motion(frame + 1),
             into_past=motion(frame - 1),

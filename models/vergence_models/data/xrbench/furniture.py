@@ -219,8 +219,10 @@ def clothes_rack(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
             b.rods(metal, 0.003, ((x, -height, 0), (x, -height + 0.09, 0)))
 
 
-def set_out(b: Workbench, p: Palette, rng: np.random.Generator, half_x: float, half_z: float,
-            y_m: float, *, count: int, tall_m: float = 0.35, front_m: float = 0.0) -> None:  # fmt: skip
+def set_out(
+    b: Workbench, p: Palette, rng: np.random.Generator, half_x: float, half_z: float, y_m: float,
+    *, count: int, tall_m: float = 0.35, front_m: float = 0.0,
+) -> None:  # fmt: skip
     """Put small things side by side on a surface at height y."""
     for x in np.linspace(-half_x, half_x, 2 * count + 1)[1::2]:
         one = Workbench()

@@ -78,7 +78,9 @@ class Plan:
             bench.box(surface, (x, -(y0 + y1) / 2, z), (half, (y1 - y0) / 2, _THICK_M))
         frame = placed(0, 0, 0, yaw=side.value)
         self.add("wall", bench, frame)
-        self.add("window", self._window(half, (high - low) / 2), frame @ placed(x, -(low + high) / 2, z))
+        self.add(
+            "window", self._window(half, (high - low) / 2), frame @ placed(x, -(low + high) / 2, z)
+        )
 
     def _window(self, half_x: float, half_y: float) -> Workbench:
         """A frame with bars, perhaps blinds. No pane: it would cost samples and change little."""
@@ -158,7 +160,9 @@ class Plan:
         own = np.concatenate([ground.min(0), ground.max(0)])
         eye = self.eye_m[[0, 2]]
         nearest = np.clip(eye, own[:2], own[2:])
-        inside = np.abs(own[[0, 2]]).max() <= self.half_x and np.abs(own[[1, 3]]).max() <= self.half_z
+        inside = (
+            np.abs(own[[0, 2]]).max() <= self.half_x and np.abs(own[[1, 3]]).max() <= self.half_z
+        )
         overlaps = any(
             (own[:2] < other[2:] - 0.02).all() and (own[2:] > other[:2] + 0.02).all()
             for other in self._taken

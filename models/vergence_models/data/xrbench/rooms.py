@@ -176,7 +176,8 @@ def _counter(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
         x, half = (2 * (k + 0.5) / doors - 1) * half_x, half_x / doors
         b.box(body, (x, -0.46, -0.258), (half - 0.006, 0.4, 0.009))
         b.rods(metal, 0.006, ((x - 0.08, -0.8, -0.285), (x + 0.08, -0.8, -0.285)))
-    b.rods(metal, 0.012, ((-0.3, -0.92, 0.2), (-0.3, -1.2, 0.2)), ((-0.3, -1.2, 0.2), (-0.3, -1.17, 0.02)))  # fmt: skip
+    foot, bend, mouth = (-0.3, -0.92, 0.2), (-0.3, -1.2, 0.2), (-0.3, -1.17, 0.02)
+    b.rods(metal, 0.012, (foot, bend), (bend, mouth))
     for x in (0.15, 0.42):
         b.add(metal, meshes.lathe([(0.11, -0.13), (0.11, 0), (0.001, 0)]), (x, -0.92, 0.05))
     furniture.set_out(b, p, rng, half_x * 0.9, 0.1, -0.92, count=5, tall_m=0.3, front_m=-0.12)

@@ -1,4 +1,4 @@
-"""Mitsuba 3 at work: the light that reaches a camera, and the first surface that each pixel sees."""
+"""Mitsuba 3 at work: the light that reaches a camera, and the first surface behind each pixel."""
 
 from __future__ import annotations
 

@@ -77,29 +77,24 @@ def _claim(recipe: Recipe, folder: Path) -> None:
 
 
 def _whole(recipe: Recipe, folder: Path, frame: int, passes: tuple[str, ...]) -> bool:
-    # The boxes are the last truth to be written, so they stand for all of it.
     images = (folder / _image_path(recipe.name, each, eye, frame) for each in passes for eye in Eye)
-    return _boxes_path(folder, recipe.name, frame).exists() and all(p.exists() for p in images)
+    return all(path.exists() for path in images)
 
 
 def _image_path(name: str, which: str, eye: Eye, frame: int) -> Path:
     return Path(f"frames_{which}pass") / name / eye.name.lower() / f"{frame:04d}.png"
 
 
-def _boxes_path(folder: Path, name: str, frame: int) -> Path:
-    return folder / "object_boxes" / name / f"{frame:04d}.json"
-
-
 def _files(camera: StereoCamera, frame: int, passes: tuple[str, ...]) -> Mapping[Path, bytes]:
-    """Every file of a frame, the boxes last."""
+    """Every file of a frame. The left images come last: whoever finds one finds the rest."""
     name = camera.recipe.name
     shoot = {"clean": camera.clean, "final": camera.final}
     images = {
         _image_path(name, each, eye, frame): _png(shoot[each](frame, eye))
+        for eye in (Eye.RIGHT, Eye.LEFT)
         for each in passes
-        for eye in Eye
     }
-    return images | _truth_files(camera.truth(frame), name, frame)
+    return {**_truth_files(camera.truth(frame), name, frame), **images}
 
 
 def _truth_files(truth: FrameTruth, name: str, frame: int) -> Mapping[Path, bytes]:
@@ -117,7 +112,7 @@ def _truth_files(truth: FrameTruth, name: str, frame: int) -> Mapping[Path, byte
         "normals" / still / picture: _png(stored_normals),
         "object_index" / still / picture: _png(truth.label),
         "specular" / still / picture: _png(truth.specular.astype(np.uint8) * 255),
-        _boxes_path(Path(), name, frame): json.dumps(truth.boxes).encode(),
+        Path("object_boxes") / name / f"{frame:04d}.json": json.dumps(truth.boxes).encode(),
     }  # fmt: skip
 
 
