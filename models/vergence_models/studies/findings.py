@@ -36,8 +36,8 @@ def main_findings(contenders: Sequence[Contender], found: Mapping[str, Tally]) -
                 limit = 1.05 if count >= 20 else 1.0  # of their RAFT-Stereo at 20 and at 7
                 lines.append(
                     f"`{tier}`: one warm iteration has {warm_epe / alone:.2f} times the EPE of the "
-                    f"same network, every frame cold, with {count} iterations (the paper: at "
-                    f"most {limit:.2f}): {verdict(warm_epe <= limit * alone)}."
+                    f"same network, every frame cold, with {count} iterations; the paper's shape: "
+                    f"at most {limit:.2f}: {verdict(warm_epe <= limit * alone)}."
                 )
     return lines
 
@@ -53,12 +53,12 @@ def warp_findings(cells: Mapping[str, Mapping[str, float]]) -> list[str]:
     for label, values in cells.items():
         lost = loss_pct(values)
         if label.endswith("state moved"):
-            told = f"the paper: under +20 %): {verdict(lost < 20)}"
+            told = f"the paper's shape: under +20 %: {verdict(lost < 20)}"
         elif label.endswith("state not moved"):
-            told = f"the paper: over +60 %): {verdict(lost > 60)}"
+            told = f"the paper's shape: over +60 %: {verdict(lost > 60)}"
         else:
             continue
-        lines.append(f"{label}: {lost:+.0f} % EPE at 6x ({told}.")
+        lines.append(f"{label}: {lost:+.0f} % EPE at 6x; {told}.")
     return lines
 
 
