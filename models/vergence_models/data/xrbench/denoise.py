@@ -22,12 +22,12 @@ def denoised(light: Light, keep: NDArray[np.bool_] | None = None) -> Planes:
     (edge-avoiding a-trous, Dammertz et al. 2010): textures come from the noiseless albedo.
     """
     surface = light.depth_m > 0
-    albedo = np.where(surface, light.albedo + _FLOOR, 1)
-    value = light.radiance / albedo
+    albedo = np.where(surface, light.albedo + np.float32(_FLOOR), np.float32(1))
+    value = np.asarray(light.radiance / albedo, np.float32)
     brightness = value.mean(-1, keepdims=True)
     limit = _BRIGHTEST * np.median(brightness) + 1e-6
-    value = value * np.minimum(1, limit / np.maximum(brightness, 1e-9))
-    depth = np.where(surface, light.depth_m, 1e6)
+    value *= np.minimum(1, limit / np.maximum(brightness, 1e-9))
+    depth = np.where(surface, light.depth_m, np.float32(1e6))
     length = np.linalg.norm(light.normals, axis=-1, keepdims=True)
     normals = light.normals / np.maximum(length, 1e-6)
     for level in range(_LEVELS):

@@ -241,9 +241,9 @@ def trinket(b: Workbench, p: Palette, rng: np.random.Generator, tall_m: float) -
         skin = p.glass() if rng.random() < 0.5 else p.ceramic()
         b.add(skin, meshes.lathe(np.array(shape) * (1, tall)))
     elif kind == 2:
-        y = np.linspace(-1, 0, 12)
-        radius = 0.05 + 0.025 * np.sin(4.5 * y + rng.uniform(0, 6))
-        b.add(p.ceramic(), meshes.lathe(np.stack([radius, y * tall], 1)))
+        along = np.linspace(-1, 0, 12)
+        swell = 0.05 + 0.025 * np.sin(4.5 * along + rng.uniform(0, 6))
+        b.add(p.ceramic(), meshes.lathe(np.stack([swell, along * tall], 1)))
     elif kind == 3:
         radius = min(tall / 2, 0.07)
         b.add(p.ceramic(), meshes.ball((radius,) * 3), (0, -radius, 0))

@@ -163,7 +163,8 @@ def _rug(plan: Plan, p: Palette) -> None:
 def _pictures(plan: Plan, p: Palette, rng: np.random.Generator, count: int) -> None:
     for _ in range(count):
         side = (Wall.FAR, Wall.RIGHT)[int(rng.integers(2))]
-        plan.hang(side, p.picture(), *rng.uniform(0.15, 0.4, 2), rng.uniform(1.4, 1.7))
+        half_x, half_y = rng.uniform(0.15, 0.4, 2)
+        plan.hang(side, p.picture(), half_x, half_y, rng.uniform(1.4, 1.7))
 
 
 def _counter(b: Workbench, p: Palette, rng: np.random.Generator) -> None:

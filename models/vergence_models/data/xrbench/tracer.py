@@ -176,7 +176,8 @@ class Tracer:
         from drjit import reinterpret_array
 
         mi = self._mi
-        return [int(reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes]
+        numbers = [np.array(reinterpret_array(mi.UInt32, mi.ShapePtr(each))) for each in shapes]
+        return [int(number[0]) for number in numbers]
 
     def _move_things(self, time_s: float) -> None:
         if time_s == self._time_s:
@@ -193,7 +194,7 @@ class Tracer:
         """Kept: a new camera of the same kind would be compiled anew by the JIT variants."""
         key = (optics, rows, centred)
         if key not in self._sensors:
-            sampler = {"type": "independent"}
+            sampler: dict[str, Any] = {"type": "independent"}
             if centred:
                 sampler = {"type": "stratified", "jitter": False, "sample_count": 1}
             fov = 2 * np.degrees(np.arctan(optics.width / 2 / optics.focal_px))
@@ -237,7 +238,8 @@ class Tracer:
         if surface.finish is Finish.GLASS:
             return {"type": "thindielectric", "specular_transmittance": color}
         if surface.finish is Finish.MIRROR:
-            inner = {"type": "conductor", "material": "none", "specular_reflectance": color}
+            inner: dict[str, Any] = {"type": "conductor", "material": "none",
+                                     "specular_reflectance": color}  # fmt: skip
         elif surface.finish is Finish.METAL:
             inner = {"type": "roughconductor", "material": "none", "alpha": surface.roughness,
                      "specular_reflectance": color}  # fmt: skip
