@@ -128,15 +128,26 @@ def export_run(run: Run, config: Config, out: Path) -> None:
 
 
 def export_stitched(network: RaftNetwork, paths: Mapping[int, Path], weights: Path) -> None:
-    """Write a graph per iteration count to ``paths``, all beside one file of ``weights``."""
-    parts = []
+    """Write a graph per iteration count to ``paths``, all beside one file of ``weights``.
+
+    One graph does what begin, iterate and end would do as graphs of their own, without handing
+    tensors from one to the next, and one call is simpler to serve; with the weights shared, five
+    counts of `full` take the room of one. ``tests/benchmarks/graph_parts.py`` measures both ways.
+    """
+    parts = exported_parts(network)
+    models = {path: stitched(parts, count) for count, path in paths.items()}
+    write_with_shared_weights(models, weights)
+
+
+def exported_parts(network: RaftNetwork) -> Parts[onnx.ModelProto]:
+    """The graphs that :func:`stitched` takes, batch norms folded."""
+    models = []
     with TemporaryDirectory() as folder:
         for part in parts_of(folded(network)):
             path = Path(folder) / "part.onnx"
             export_part(part, path)
-            parts.append(onnx.load(path))
-    models = {path: stitched(Parts(*parts), count) for count, path in paths.items()}
-    write_with_shared_weights(models, weights)
+            models.append(onnx.load(path))
+    return Parts(*models)
 
 
 def named(path: Path) -> dict[str, str]:
@@ -159,8 +170,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder for graphs and manifest")
     given = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-    logging.getLogger("onnxscript").setLevel(logging.ERROR)
+    for chatty in ("torch.onnx", "onnxscript", "onnx_ir"):
+        logging.getLogger(chatty).setLevel(logging.ERROR)
     run = read_run(given.run)
     export_run(run, load_config(run.config_name), given.out)
 

@@ -1,0 +1,111 @@
+"""One graph per iteration count against three graphs run in turn: a step of full or fast.
+
+    python tests/benchmarks/graph_parts.py --model fast --json FILE
+
+640x480, batch 1, fresh weights (times do not depend on them). The methods take turns, so that a
+busy moment of the machine hits all of them; medians in milliseconds. The bytes are of one graph
+per count with and without weights in a file of their own.
+"""
+
+import argparse
+import json
+import logging
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import onnx
+import onnxruntime
+from numpy.typing import NDArray
+
+from vergence_models.config import RaftNetworkConfig, load_config
+from vergence_models.export import exported_parts
+from vergence_models.raft.network import RaftNetwork
+from vergence_models.stitch import Parts, stitched, write_with_shared_weights
+from vergence_proto.model_io import LEFT, RIGHT, UVD_CURR_FROM_PREV
+
+HEIGHT, WIDTH = 480, 640
+COUNTS = (1, 2, 5, 7, 20)
+MEASURED = (1, 5)
+Feed = dict[str, NDArray[np.generic]]
+
+
+def session_of(path: Path, threads: int) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    return onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+
+
+def in_turn(sessions: Parts[onnxruntime.InferenceSession], feed: Feed, count: int) -> None:
+    """A step by three graphs: what one hands over is the next one's input."""
+    names = [output.name for output in sessions.begin.get_outputs()]
+    tensors = dict(zip(names, sessions.begin.run(None, feed), strict=True))
+    moving = names[-len(sessions.iterate.get_outputs()) :]
+    for _ in range(count):
+        tensors |= zip(moving, sessions.iterate.run(None, tensors), strict=True)
+    wanted = {entry.name for entry in sessions.end.get_inputs()}
+    sessions.end.run(None, {name: value for name, value in tensors.items() if name in wanted})
+
+
+def measure(methods: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
+    times: dict[str, list[float]] = {name: [] for name in methods}
+    for turn in range(rounds + 1):
+        for name, run in methods.items():
+            start = time.perf_counter()
+            run()
+            if turn:  # the first warms up
+                times[name].append(1e3 * (time.perf_counter() - start))
+    return {name: round(float(np.median(values)), 1) for name, values in times.items()}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--model", choices=["full", "fast"], default="fast")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--rounds", type=int, default=8)
+    given = parser.parse_args()
+    for chatty in ("torch.onnx", "onnxscript", "onnx_ir"):
+        logging.getLogger(chatty).setLevel(logging.ERROR)
+    config = load_config(given.model).network
+    assert isinstance(config, RaftNetworkConfig)
+    network = RaftNetwork(config).eval()
+    parts = exported_parts(network)
+    with TemporaryDirectory() as folder:
+        out = Path(folder)
+        apart = [out / f"{name}.onnx" for name in Parts._fields]
+        for part, path in zip(parts, apart, strict=True):
+            onnx.save(part, path)
+        paths = {count: out / f"step_{count}.onnx" for count in COUNTS}
+        models = {path: stitched(parts, count) for count, path in paths.items()}
+        whole = sum(model.ByteSize() for model in models.values())
+        write_with_shared_weights(models, out / "weights")
+        shared = sum(path.stat().st_size for path in (*paths.values(), out / "weights"))
+        sessions = Parts(*(session_of(path, given.threads) for path in apart))
+        fused = {count: session_of(paths[count], given.threads) for count in MEASURED}
+        images = np.random.default_rng(0).integers(0, 256, (2, 1, HEIGHT, WIDTH, 3), np.uint8)
+        feed: Feed = {
+            LEFT: images[0],
+            RIGHT: images[1],
+            UVD_CURR_FROM_PREV: np.eye(4, dtype=np.float32)[None],
+        }
+        state = network.cold_state(1, HEIGHT, WIDTH)
+        for tensor, value in zip(network.state_tensors, state, strict=True):
+            feed[tensor.input_name] = value.numpy()
+        methods: dict[str, Callable[[], object]] = {}
+        for count in MEASURED:
+            methods[f"fused_{count}_ms"] = partial(fused[count].run, None, feed)
+            methods[f"in_turn_{count}_ms"] = partial(in_turn, sessions, feed, count)
+        results = measure(methods, given.rounds)
+    results |= {"embedded_mb": round(whole / 1e6, 1), "shared_mb": round(shared / 1e6, 1)}
+    sys.stdout.write(" ".join(f"{name} {value}" for name, value in results.items()) + "\n")
+    if given.json:
+        given.json.write_text(json.dumps({"model": given.model, **results}) + "\n", "utf-8")
+
+
+if __name__ == "__main__":
+    main()
