@@ -12,7 +12,7 @@ from vergence_proto.model_io import ManifestError
 from vergence_service.app import Running
 from vergence_service.app import serve as serve_until_stopped
 from vergence_service.memory import keep_freed_memory
-from vergence_service.model import ProviderUnavailable
+from vergence_service.providers import ProviderUnavailable
 from vergence_service.settings import SettingsError, load_settings
 from vergence_service.transports import ExtraMissing, PortTaken, ZenohUnreachable
 

@@ -6,14 +6,14 @@ may step it again; a sequence is a pure function of its frames.
 
 import importlib.util
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-import onnxruntime
 from numpy.typing import NDArray
+from onnxruntime import InferenceSession, SessionOptions
 
 from vergence_proto.errors import NonFinite
 from vergence_proto.geometry import Pose, RectifiedRig, uvd_curr_from_prev
@@ -27,11 +27,20 @@ from vergence_proto.model_io import (
     load_model_card,
 )
 from vergence_proto.types import Image, Plane
+from vergence_service.providers import (
+    Resident,
+    device_of,
+    require_provider,
+    run_on_device,
+    start_session,
+)
 
 log = logging.getLogger(__name__)
 
-Tensor = NDArray[np.float32]  # [C, h, w]
+# [C, h, w], or [1, C, h, w] where it stayed on a device.
+Tensor = NDArray[np.float32] | Resident
 
+_MAPS = (DISPARITY, SIGMA)
 _NO_MOTION = np.eye(4, dtype=np.float32)
 
 
@@ -132,22 +141,10 @@ class StereoModel(Protocol):
         ...
 
 
-class ProviderUnavailable(RuntimeError):
-    """The execution provider asked for cannot be used on this machine."""
-
-
-# The names a person writes in the settings, and onnxruntime's.
-PROVIDERS: Mapping[str, str] = {
-    "cpu": "CPUExecutionProvider",
-    "cuda": "CUDAExecutionProvider",
-    "tensorrt": "TensorrtExecutionProvider",
-    "openvino": "OpenVINOExecutionProvider",
-}
-
-
 class OnnxStereoModel:
     """A model of the manifest under onnxruntime: one graph per iteration count.
 
+    States stay where the first provider computes them; ``states_on`` names another device.
     Raises ManifestError (see :func:`vergence_proto.model_io.load_model_card`) and
     ProviderUnavailable.
     """
@@ -160,10 +157,12 @@ class OnnxStereoModel:
         providers: Sequence[str],
         threads: int,
         allow_spinning: bool,
+        states_on: str | None = None,
     ) -> None:
         self._card = load_model_card(weights_dir, name)
-        self._providers = [_available(provider) for provider in providers]
-        self._options = onnxruntime.SessionOptions()
+        self._providers = [require_provider(provider) for provider in providers]
+        self._device = states_on or device_of(providers[0])
+        self._options = SessionOptions()
         self._options.intra_op_num_threads = threads
         # Planning the reuse of buffers took a second of a long graph's start and saved no memory:
         # the arena gives freed buffers out again without a plan, and steps are as quick.
@@ -171,12 +170,8 @@ class OnnxStereoModel:
         self._options.add_session_config_entry(
             "session.intra_op.allow_spinning", "1" if allow_spinning else "0"
         )
-        self._outputs = [
-            DISPARITY,
-            SIGMA,
-            *(tensor.output_name for tensor in self._card.state),
-        ]
-        self._sessions: dict[int, onnxruntime.InferenceSession] = {}
+        self._next = [tensor.output_name for tensor in self._card.state]
+        self._sessions: dict[int, InferenceSession] = {}
 
     @property
     def card(self) -> ModelCard:
@@ -192,50 +187,65 @@ class OnnxStereoModel:
 
     def step(self, steps: Sequence[Step]) -> list[StepResult]:
         height, width = steps[0].view.left.shape[:2]
-        disparity, sigma, *tensors = self._session(steps[0].iterations).run(
-            self._outputs, self._feeds(steps)
-        )
-        if not all(np.isfinite(output).all() for output in (disparity, sigma, *tensors)):
+        session, feeds = self._session(steps[0].iterations), self._feeds(steps)
+        tensors: Sequence[Tensor]
+        if self._device is None:
+            disparity, sigma, *tensors = session.run([*_MAPS, *self._next], feeds)
+            to_check = [disparity, sigma, *tensors]
+        else:
+            (disparity, sigma), tensors = run_on_device(
+                session, feeds, to_host=_MAPS, to_stay=self._next, device=self._device
+            )
+            # What is not finite in a state that stays shows in the maps of the next step.
+            to_check = [disparity, sigma]
+        if not all(np.isfinite(values).all() for values in to_check):
             raise NonFinite("the network's result was not finite; the stream starts anew")
+        states = _rows(tensors, len(steps))
         return [
             StepResult(
                 disparity[row, :height, :width],
                 sigma[row, :height, :width],
-                RecurrentState.after(
-                    step.view, step.state, tuple(tensor[row] for tensor in tensors)
-                ),
+                RecurrentState.after(step.view, step.state, states[row]),
             )
             for row, step in enumerate(steps)
         ]
 
-    def _feeds(self, steps: Sequence[Step]) -> dict[str, NDArray[np.generic]]:
+    def _feeds(self, steps: Sequence[Step]) -> dict[str, NDArray[np.generic] | Resident]:
         left = _stack([self._card.grown(step.view.left) for step in steps])
-        feeds: dict[str, NDArray[np.generic]] = {
+        feeds: dict[str, NDArray[np.generic] | Resident] = {
             LEFT: left,
             RIGHT: _stack([self._card.grown(step.view.right) for step in steps]),
             UVD_CURR_FROM_PREV: _stack([step.uvd_curr_from_prev for step in steps]),
         }
         for index, tensor in enumerate(self._card.state):
             nothing = np.zeros(tensor.shape(*left.shape[1:3]), np.float32)
-            feeds[tensor.input_name] = _stack(
-                [nothing if step.state is None else step.state.tensors[index] for step in steps]
+            before = [step.state.tensors[index] if step.state else nothing for step in steps]
+            feeds[tensor.input_name] = (
+                before[0]
+                if len(before) == 1 and isinstance(before[0], Resident)
+                else _stack([*map(on_host, before)])
             )
         return feeds
 
-    def _session(self, iterations: int) -> onnxruntime.InferenceSession:
+    def _session(self, iterations: int) -> InferenceSession:
         if iterations not in self._sessions:
-            session = onnxruntime.InferenceSession(
-                self._card.graphs[iterations], self._options, providers=self._providers
-            )
-            # onnxruntime falls back to the CPU with a warning; a server must not, unasked.
-            if session.get_providers()[0] != self._providers[0]:
-                raise ProviderUnavailable(
-                    f"{self._providers[0]} is installed but failed to start; onnxruntime's own "
-                    "message above says why (a missing driver or library, most often)"
-                )
-            self._sessions[iterations] = session
+            graph = self._card.graphs[iterations]
+            self._sessions[iterations] = start_session(graph, self._options, self._providers)
             log.info("loaded %s, %d iterations", self._card.name, iterations)
         return self._sessions[iterations]
+
+
+def on_host(tensor: Tensor) -> NDArray[np.float32]:
+    """[C, h, w], wherever it was."""
+    return tensor.on_host()[0] if isinstance(tensor, Resident) else tensor
+
+
+def _rows(tensors: Sequence[Tensor], count: int) -> list[tuple[Tensor, ...]]:
+    """The states of the rows of a batch. A lone one stays where it is, several go to the host."""
+    if count == 1 and isinstance(tensors[0], Resident):
+        return [tuple(tensors)]
+    batches = [each.on_host() if isinstance(each, Resident) else each for each in tensors]
+    return [tuple(batch[row] for batch in batches) for row in range(count)]
 
 
 def state_bytes(card: ModelCard, height: int, width: int) -> int:
@@ -253,17 +263,6 @@ def packaged_weights_dir() -> Path:
     if spec is None or not spec.submodule_search_locations:
         raise FileNotFoundError("no weights are installed; give a folder that has a manifest.json")
     return Path(next(iter(spec.submodule_search_locations))) / "weights"
-
-
-def _available(provider: str) -> str:
-    available = onnxruntime.get_available_providers()
-    usable = [name for name, full_name in PROVIDERS.items() if full_name in available]
-    if provider not in usable:
-        raise ProviderUnavailable(
-            f"provider {provider!r} is not available in the installed onnxruntime; "
-            f"it has {', '.join(usable)}"
-        )
-    return PROVIDERS[provider]
 
 
 def _stack(rows: Sequence[NDArray[np.generic]]) -> NDArray[np.generic]:

@@ -9,7 +9,7 @@ import zlib
 import numpy as np
 
 from vergence_proto.geometry import Pose, RectifiedRig
-from vergence_service.model import RecurrentState
+from vergence_service.model import RecurrentState, on_host
 
 _ABOUT = "about"
 
@@ -28,7 +28,7 @@ def state_to_bytes(state: RecurrentState) -> bytes:
         "position_known": state.position_known,
         "step_count": state.step_count,
     }
-    arrays = {str(index): tensor for index, tensor in enumerate(state.tensors)}
+    arrays = {str(index): on_host(tensor) for index, tensor in enumerate(state.tensors)}
     file = io.BytesIO()
     np.savez(file, allow_pickle=False, **{_ABOUT: np.array(json.dumps(about))}, **arrays)
     return file.getvalue()

@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import onnxruntime
 import pytest
 
 from tests.support.frames import make_frame
@@ -13,21 +14,32 @@ from vergence_proto.geometry import RectifiedRig
 from vergence_proto.model_io import MANIFEST_NAME
 from vergence_service.model import (
     OnnxStereoModel,
-    ProviderUnavailable,
     RecurrentState,
     Step,
     StepResult,
     View,
+    on_host,
     packaged_weights_dir,
     state_bytes,
 )
+from vergence_service.providers import (
+    PROVIDERS,
+    ProviderUnavailable,
+    Resident,
+    require_provider,
+)
+from vergence_service.snapshots import state_from_bytes, state_to_bytes
 
 # 250 x 130: neither is a multiple of any stride.
 RIG = RectifiedRig(250, 130, 200.0, 200.0, 124.5, 124.5, 64.5, 0.1)
 
 
 def make_model(
-    name: str = "lite", *, threads: int = 1, weights: Path | None = None
+    name: str = "lite",
+    *,
+    threads: int = 1,
+    weights: Path | None = None,
+    states_on: str | None = None,
 ) -> OnnxStereoModel:
     return OnnxStereoModel(
         weights or packaged_weights_dir(),
@@ -35,6 +47,7 @@ def make_model(
         providers=["cpu"],
         threads=threads,
         allow_spinning=False,
+        states_on=states_on,
     )
 
 
@@ -89,7 +102,7 @@ def test_warm_and_cold_streams_share_a_batch(model: OnnxStereoModel) -> None:
 
 def test_a_step_changes_neither_its_state_nor_its_images(model: OnnxStereoModel) -> None:
     [first] = model.step([Step(make_view(1, 7), None, 1)])
-    before = [tensor.copy() for tensor in first.state.tensors]
+    before = [on_host(tensor).copy() for tensor in first.state.tensors]
     step = Step(make_view(2, 7), first.state, 1)
     once, again = model.step([step])[0], model.step([step])[0]
     np.testing.assert_array_equal(once.offset_px, again.offset_px)
@@ -140,11 +153,53 @@ def test_a_result_that_is_not_finite_is_not_passed_on() -> None:
         model.step([Step(View(black, bright, RIG, 1), None, 1)])
 
 
-def test_a_provider_that_is_not_there_is_refused_by_name() -> None:
-    with pytest.raises(ProviderUnavailable, match=r"'tensorrt' is not available.*it has cpu"):
+def test_states_that_stay_on_their_device_change_no_result(model: OnnxStereoModel) -> None:
+    """The path of a GPU, taken on the only device that is everywhere."""
+    resident = make_model(states_on="cpu", threads=2)
+    for mine, plain in zip(walk(resident, 4, frames=3), walk(model, 4, frames=3), strict=True):
+        np.testing.assert_array_equal(mine.offset_px, plain.offset_px)
+        np.testing.assert_array_equal(mine.sigma_px, plain.sigma_px)
+        assert all(isinstance(tensor, Resident) for tensor in mine.state.tensors)
+        assert mine.state.nbytes == plain.state.nbytes
+        for tensor, same in zip(mine.state.tensors, plain.state.tensors, strict=True):
+            np.testing.assert_array_equal(on_host(tensor), on_host(same))
+
+
+def test_a_state_that_stayed_joins_a_batch_and_a_snapshot(model: OnnxStereoModel) -> None:
+    resident = make_model(states_on="cpu", threads=2)
+    [stayed] = resident.step([Step(make_view(1, 5), None, 1)])
+    [plain] = model.step([Step(make_view(1, 5), None, 1)])
+    cold = Step(make_view(1, 6), None, 1)
+    expected = model.step([Step(make_view(2, 5), plain.state, 1), cold])
+    kept = state_from_bytes(state_to_bytes(stayed.state))
+    for state in (stayed.state, kept):
+        together = resident.step([Step(make_view(2, 5), state, 1), cold])
+        for result, same in zip(together, expected, strict=True):
+            np.testing.assert_array_equal(result.offset_px, same.offset_px)
+        [alone] = resident.step([Step(make_view(3, 5), together[0].state, 1)])
+        [same] = model.step([Step(make_view(3, 5), expected[0].state, 1)])
+        np.testing.assert_array_equal(alone.offset_px, same.offset_px)
+
+
+@pytest.mark.parametrize(
+    ("provider", "wheel"),
+    [
+        ("cuda", "onnxruntime-gpu"),
+        ("tensorrt", "onnxruntime-gpu"),
+        ("openvino", "onnxruntime-openvino"),
+    ],
+)
+def test_a_provider_that_is_not_there_is_refused_with_what_to_install(
+    provider: str, wheel: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # As the wheel of the server extra has it, whichever one is installed here.
+    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: [PROVIDERS["cpu"]])
+    says = rf"'{provider}' is not available.*it has cpu\. .*pip install {wheel}$"
+    with pytest.raises(ProviderUnavailable, match=says):
         OnnxStereoModel(
-            packaged_weights_dir(), "lite", providers=["tensorrt"], threads=1, allow_spinning=False
+            packaged_weights_dir(), "lite", providers=[provider], threads=1, allow_spinning=False
         )
+    assert require_provider("cpu") == PROVIDERS["cpu"]
 
 
 def test_the_manifest_names_what_is_there(model: OnnxStereoModel) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from vergence_proto.errors import NonFinite
 from vergence_proto.model_io import ModelCard, StateTensor
-from vergence_service.model import RecurrentState, Step, StepResult
+from vergence_service.model import RecurrentState, Step, StepResult, on_host
 
 # The value of a left image's first pixel that makes the model fail on it.
 RAISES = 255
@@ -51,7 +51,7 @@ class RecallModel:
         return [self._step_one(row) for row in steps]
 
     def _step_one(self, row: Step) -> StepResult:
-        memory = row.state.tensors[0][0] if row.state else np.float32(0)
+        memory = on_host(row.state.tensors[0])[0] if row.state else np.float32(0)
         motion = row.uvd_curr_from_prev - np.eye(4, dtype=np.float32)
         brightness = row.view.left.mean(axis=2, dtype=np.float32) / 64
         offset_px = 4 + brightness + np.abs(motion).sum() + memory / 2
