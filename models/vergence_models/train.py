@@ -2,6 +2,7 @@
 
     python -m vergence_models.train --config lite --pool pool/a --val pool/val --out runs/lite
     python -m vergence_models.train ... --out runs/lite --resume --minutes 60
+    python -m vergence_models.train --config full --batch 8 --frames 16 --workers 14 ...  # on a GPU
 
 A run can be stopped at any minute (a signal or ``--minutes``) and goes on where it was: weights,
 moving average, optimizer, step and random states are in its checkpoint.
@@ -24,164 +25,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from vergence_models.augment import filmed, stretched
-from vergence_models.config import CONFIGS, Config, Precision, load_config
-from vergence_models.data.clips import StereoClips
+from vergence_models.config import CONFIGS, load_config
 from vergence_models.data.pool import ClipPool
-from vergence_models.motion import perturbed, uvd_transforms
-from vergence_models.runs import (
-    CHECKPOINT_NAME,
-    Progress,
-    load_checkpoint,
-    require_same_network,
-    save_checkpoint,
-)
-from vergence_models.tiers import AnyNetwork, build_network
+from vergence_models.feeding import batches
+from vergence_models.runs import CHECKPOINT_NAME
+from vergence_models.trainer import Trainer, learning_rate
 from vergence_models.validation import save_picture, validate
 
 log = logging.getLogger("vergence_models.train")
-
-
-def learning_rate(config: Config, step: int) -> float:
-    """Linear warm-up, cosine to a tenth, then constant: a run can always be extended."""
-    training = config.training
-    warm = min(1.0, (step + 1) / training.warmup_steps)
-    done = min(1.0, step / training.decay_steps)
-    return training.learning_rate * warm * (0.1 + 0.45 * (1 + math.cos(math.pi * done)))
-
-
-class Trainer:
-    """Weights and everything that changes while they are trained."""
-
-    def __init__(self, config: Config, device: torch.device) -> None:
-        torch.manual_seed(config.training.seed)
-        self.config = config
-        self.device = device
-        self.network = build_network(config.network).to(device)
-        if config.training.precision is Precision.BF16:  # the layout of the kernels for it
-            self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
-        self.optimizer = torch.optim.AdamW(
-            self.network.parameters(),
-            lr=config.training.learning_rate,
-            betas=(0.9, 0.99),
-            weight_decay=config.training.weight_decay,
-        )
-        self.random = np.random.default_rng(config.training.seed)
-        self.progress = Progress()
-        self.measured: dict[str, float] = {}
-        self.commands: list[str] = []
-
-    def save(self, folder: Path) -> None:
-        training = self.config.training
-        story = {
-            "commands": self.commands,
-            **dataclasses.asdict(self.progress),
-            "device": self.device.type,
-            "seed": training.seed,
-        }
-        save_checkpoint(
-            folder,
-            {
-                "config": self.config.name,
-                "network": dataclasses.asdict(self.config.network),
-                "weights": self.network.state_dict(),
-                "average": self.average,
-                "optimizer": self.optimizer.state_dict(),
-                "random": self.random.bit_generator.state,
-                "progress": dataclasses.asdict(self.progress),
-                "story": story,
-                "measured": self.measured,
-            },
-        )
-
-    def resume(self, folder: Path) -> None:
-        """Go on from a run's checkpoint. Raises RunError if it is of another configuration."""
-        contents = load_checkpoint(folder)
-        require_same_network(contents, self.config, folder / CHECKPOINT_NAME)
-        self.network.load_state_dict(contents["weights"])
-        self.average = {k: v.to(self.device) for k, v in contents["average"].items()}
-        self.optimizer.load_state_dict(contents["optimizer"])
-        self.random.bit_generator.state = contents["random"]
-        self.progress = Progress(**contents["progress"])
-        self.measured = contents["measured"]
-        self.commands = contents["story"]["commands"]
-
-    def autocast(self) -> torch.autocast:
-        """Convolutions and matrix products in the precision that was asked for."""
-        wanted = self.config.training.precision is Precision.BF16
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=wanted)
-
-    def chance(self, share: float) -> bool:
-        return bool(self.random.random() < share)
-
-    def transforms(self, clips: StereoClips) -> Tensor:
-        """The motion the network is told, float32 [B, T, 4, 4]: true, noisy, or none at all."""
-        training = self.config.training
-        poses = clips.world_from_left
-        if self.chance(training.identity_share):
-            poses = poses[:, :1].expand_as(poses)
-        elif self.chance(training.noise_share):
-            poses = perturbed(
-                poses, max_deg=training.noise_deg, max_m=training.noise_m, random=self.random
-            )
-        return uvd_transforms(clips, poses)
-
-    def step(self, clips: StereoClips) -> dict[str, float]:
-        """One update on a batch of clips, with the gradient through the whole clip."""
-        training, network = self.config.training, self.network
-        for group in self.optimizer.param_groups:
-            group["lr"] = learning_rate(self.config, self.progress.steps)
-        matrices = self.transforms(clips).to(self.device)
-        clips = clips.to(self.device)
-        batch, frames, _, height, width = clips.left.shape
-        state = cold = network.cold_state(batch, height, width)
-        loss = torch.zeros((), device=self.device)
-        errors = []
-        for frame in range(frames):
-            reset = frame == 0 or self.chance(training.reset_share)
-            if reset:
-                state = cold
-            most = training.cold_iterations
-            iterations = (
-                int(self.random.integers(1, most + 1)) if reset else 1 + int(self.chance(0.2))
-            )
-            left, right = (
-                eye[:, frame].permute(0, 2, 3, 1).contiguous() for eye in (clips.left, clips.right)
-            )
-            with self.autocast():
-                estimate, state = network(left, right, matrices[:, frame], state, iterations)
-            truth = clips.disparity_px[:, frame]
-            loss = loss + estimate.loss(truth, self.config.network.max_disparity_px) / frames
-            errors.append((estimate.disparity.detach() - truth).abs()[truth > 0].mean().item())
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]  # torch annotates it so
-        norm = torch.nn.utils.clip_grad_norm_(network.parameters(), training.gradient_norm)
-        if torch.isfinite(norm):  # one bad batch must not end a long run
-            self.optimizer.step()
-        # A young average follows quickly, an old one slowly.
-        decay = min(training.ema_decay, (1 + self.progress.steps) / (10 + self.progress.steps))
-        for name, value in network.state_dict().items():
-            if value.is_floating_point():
-                self.average[name].lerp_(value, 1 - decay)
-            else:  # a count of batches
-                self.average[name].copy_(value)
-        self.progress.steps += 1
-        self.progress.frames += batch * frames
-        return {
-            "loss": loss.item(),
-            "norm": norm.item(),
-            "first": errors[0],
-            "later": float(np.mean(errors[1:])) if frames > 1 else errors[0],
-        }
-
-    def averaged_network(self) -> AnyNetwork:
-        """The network with the averaged weights: the one to validate and export."""
-        network = build_network(self.config.network).to(self.device).eval()
-        network.load_state_dict(self.average)
-        return network
 
 
 def train(trainer: Trainer, arguments: argparse.Namespace) -> None:
@@ -194,22 +46,22 @@ def train(trainer: Trainer, arguments: argparse.Namespace) -> None:
 
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, on_signal)
-    pool = ClipPool(*arguments.pool)
     held_out = ClipPool(*arguments.val) if arguments.val else None
     out: Path = arguments.out
-    training = trainer.config.training
     started = saved = validated = last = time.monotonic()
     recent: list[dict[str, float]] = []
 
     def elapsed_minutes() -> float:
         return (time.monotonic() - started) / 60
 
+    eaten = batches(
+        arguments.pool,
+        trainer.config.training,
+        first_step=trainer.progress.steps,
+        workers=arguments.workers,
+    )
     while not stop and elapsed_minutes() < arguments.minutes:
-        clips = pool.sample(
-            trainer.random, training.batch, frames=training.frames, reverse=0.5, skip=0.3, flip=0.3
-        )
-        clips = stretched(clips, trainer.random, share=training.stretch_share)
-        recent.append(trainer.step(filmed(clips, trainer.random, clean_share=training.clean_share)))
+        recent.append(trainer.step(next(eaten)))
         now = time.monotonic()
         trainer.progress.minutes += (now - last) / 60
         last = now
@@ -219,7 +71,6 @@ def train(trainer: Trainer, arguments: argparse.Namespace) -> None:
         if now - saved > 60 * arguments.save_minutes:
             saved = now
             trainer.save(out)
-            pool.refresh()  # a pool may still be growing
         if held_out is not None and now - validated > 60 * arguments.val_minutes:
             network = trainer.averaged_network()
             trainer.measured = validate(network, held_out, trainer.device)
@@ -230,6 +81,7 @@ def train(trainer: Trainer, arguments: argparse.Namespace) -> None:
     if held_out is not None and trainer.progress.steps:
         trainer.measured = validate(trainer.averaged_network(), held_out, trainer.device)
         write_line(out, {"step": trainer.progress.steps, "validation": trainer.measured})
+    eaten.close()
     trainer.save(out)
 
 
@@ -265,6 +117,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     add("--resume", action="store_true", help="go on with the run in --out")
     add("--minutes", type=float, default=math.inf, help="of this session")
     add("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    add("--workers", type=int, default=0, help="processes that make batches; 0: this one")
     add("--log-every", type=int, default=20, help="steps")
     add("--save-minutes", type=float, default=3)
     add("--val-minutes", type=float, default=10)

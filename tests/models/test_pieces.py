@@ -14,7 +14,7 @@ from vergence_models.config import Config, Precision, RaftNetworkConfig, Trainin
 from vergence_models.data.clips import StereoClips
 from vergence_models.pieces import PIECE_BYTES, joined, split
 from vergence_models.runs import CHECKPOINT_NAME, RunError, load_checkpoint, read_run
-from vergence_models.train import Trainer
+from vergence_models.trainer import Trainer
 
 # No fewer channels: backward of a strided 1x1 convolution of 8 corrupts memory in torch 2.13.
 NETWORK = RaftNetworkConfig(

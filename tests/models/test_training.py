@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -13,10 +14,12 @@ from tests.models.clips import wall_clips
 from vergence_models import config as configs
 from vergence_models.config import Config, LiteNetworkConfig, TrainingConfig, load_config
 from vergence_models.data.pool import ClipPool, write_shard
+from vergence_models.feeding import batches
 from vergence_models.losses import doubt_loss
 from vergence_models.motion import perturbed, uvd_transforms
 from vergence_models.runs import CHECKPOINT_NAME, RunError, load_checkpoint, read_run
-from vergence_models.train import Trainer, main
+from vergence_models.train import main
+from vergence_models.trainer import Trainer
 from vergence_models.validation import predict, validate
 
 NETWORK = LiteNetworkConfig(context_eighth=16, context_low=16)
@@ -149,6 +152,20 @@ def test_noise_of_poses_stays_small_and_rigid() -> None:
     rotation = noisy[..., :3, :3]
     assert torch.allclose(rotation @ rotation.mT, torch.eye(3, dtype=torch.float64), atol=1e-9)
     assert 0 < (noisy - poses).abs().max() < 0.02
+
+
+def test_batches_depend_on_the_step_alone_whoever_makes_them(pool: Path) -> None:
+    def first_two(first_step: int, workers: int) -> list[torch.Tensor]:
+        with closing(
+            batches([pool], SMALL.training, first_step=first_step, workers=workers)
+        ) as made:
+            return [next(made).left for _ in range(2)]
+
+    here = first_two(0, 0)
+    assert torch.equal(first_two(1, 0)[0], here[1])
+    assert not torch.equal(here[0], here[1])
+    for made, expected in zip(first_two(0, 1), here, strict=True):
+        assert torch.equal(made, expected)
 
 
 def test_validation_measures_cold_and_warm(pool: Path) -> None:
