@@ -1,0 +1,125 @@
+"""Int8 graphs of a tier: ranges found on some clips, the loss measured on others.
+
+The clips are synthetic, of the kind that validation uses. Each graph steps through them with its
+own state, so that the ranges are those of recurrent use.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+from numpy.typing import NDArray
+from onnx import ModelProto, TensorProto, helper
+
+from vergence_models.data.clips import StereoClips
+from vergence_models.data.pool import ClipPool
+from vergence_models.motion import uvd_transforms
+from vergence_models.quantize import Scale, copy_of, plan, quantized
+from vergence_models.tiers import AnyNetwork
+from vergence_models.validation import filmed
+from vergence_proto.model_io import DISPARITY, LEFT, RIGHT, UVD_CURR_FROM_PREV, StateTensor
+
+Array = NDArray[np.generic]
+
+RANGE_CLIPS = 4
+MEASURED_CLIPS = 16  # those that follow
+BATCH = 4
+MAX_LOSS = 1.03  # EPE of the int8 graph over that of the float one
+
+
+class QuantizationError(RuntimeError):
+    """An int8 graph loses too much."""
+
+
+def make_int8(paths: Mapping[int, Path], network: AnyNetwork, pool: ClipPool) -> dict[str, object]:
+    """Replace float graphs, by iteration count, with int8 ones; returns the story for the manifest.
+
+    Raises QuantizationError if that costs the smallest graph more than :data:`MAX_LOSS`.
+    """
+    states = network.state_tensors
+    clips = filmed(pool, range(RANGE_CLIPS))
+    story: dict[str, object] = {}
+    for count, path in sorted(paths.items()):
+        model = onnx.load(path)
+        what = plan(model)
+        int8 = quantized(model, what, find_scales(model, what.measured, states, clips))
+        if not story:
+            limit = network.config.max_disparity_px
+            before, after = (epe_px(each, states, pool, limit) for each in (model, int8))
+            if not after < MAX_LOSS * before:
+                raise QuantizationError(
+                    f"{path}: EPE {after:.3f} px as int8, {before:.3f} px before; "
+                    f"expected less than {MAX_LOSS:g} times as much"
+                )
+            story = {
+                "convolutions": len(what.convolutions),
+                "range_clips": RANGE_CLIPS,
+                "measured_clips": MEASURED_CLIPS,
+                "iterations": count,
+                "epe_px": round(after, 4),
+                "float_epe_px": round(before, 4),
+            }
+        onnx.save(int8, path)
+    return story
+
+
+def steps(
+    model: ModelProto, states: Sequence[StateTensor], clips: StereoClips, names: Sequence[str]
+) -> Iterator[dict[str, Array]]:
+    """Step a graph through clips, the first frame cold: after every frame the named tensors."""
+    model = copy_of(model)
+    known = {output.name for output in model.graph.output}
+    model.graph.output.extend(
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, None)
+        for name in names
+        if name not in known
+    )
+    session = onnxruntime.InferenceSession(
+        model.SerializeToString(), providers=["CPUExecutionProvider"]
+    )
+    wanted = [*names, *(tensor.output_name for tensor in states)]
+    matrices = uvd_transforms(clips, clips.world_from_left).numpy()
+    batch, frames, _, height, width = clips.left.shape
+    state = {t.input_name: np.zeros((batch, *t.shape(height, width)), np.float32) for t in states}
+    for frame in range(frames):
+        left, right = (
+            eye[:, frame].permute(0, 2, 3, 1).contiguous().numpy()
+            for eye in (clips.left, clips.right)
+        )
+        images = {LEFT: left, RIGHT: right, UVD_CURR_FROM_PREV: matrices[:, frame]}
+        found = session.run(wanted, {**images, **state})
+        yield dict(zip(names, found, strict=False))
+        state = {
+            tensor.input_name: value
+            for tensor, value in zip(states, found[len(names) :], strict=True)
+        }
+
+
+def find_scales(
+    model: ModelProto, names: Sequence[str], states: Sequence[StateTensor], clips: StereoClips
+) -> dict[str, Scale]:
+    """For each tensor the scale that covers all that it holds while the graph sees the clips."""
+    low, high = dict.fromkeys(names, 0.0), dict.fromkeys(names, 0.0)
+    for found in steps(model, states, clips, names):
+        for name, values in found.items():
+            low[name] = min(low[name], float(values.min()))
+            high[name] = max(high[name], float(values.max()))
+    return {name: Scale.of_range(low[name], high[name]) for name in names}
+
+
+def epe_px(
+    model: ModelProto, states: Sequence[StateTensor], pool: ClipPool, limit_px: float
+) -> float:
+    """Mean error of a graph's disparity, in px, where the truth is below the limit."""
+    errors = []
+    for start in range(RANGE_CLIPS, RANGE_CLIPS + MEASURED_CLIPS, BATCH):
+        clips = filmed(pool, range(start, start + BATCH))
+        for frame, found in enumerate(steps(model, states, clips, [DISPARITY])):
+            truth = clips.disparity_px[:, frame].numpy()
+            known = (truth > 0) & (truth < limit_px)
+            errors.append(np.abs(found[DISPARITY] - truth)[known].mean())
+    return float(np.mean(errors))
