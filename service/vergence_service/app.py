@@ -16,7 +16,7 @@ from vergence_service.http_face import serving_http
 from vergence_service.metrics import Metrics
 from vergence_service.model import OnnxStereoModel, StereoModel, packaged_weights_dir
 from vergence_service.settings import Settings
-from vergence_service.streams import StreamTable
+from vergence_service.stream_table import StreamTable
 from vergence_service.transports import place
 from vergence_service.transports.calls import OpenCalls
 from vergence_service.transports.depth_call import StreamLimits

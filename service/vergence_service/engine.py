@@ -28,7 +28,8 @@ from vergence_service.continuity import ContinuityLimits
 from vergence_service.metrics import Metrics
 from vergence_service.model import RecurrentState, Step, View, state_bytes
 from vergence_service.rectify import Rectifier
-from vergence_service.streams import Attachment, Notice, NoticeKind, Opening, Stream, StreamTable
+from vergence_service.stream_table import StreamTable
+from vergence_service.streams import Attachment, Notice, NoticeKind, Opening, Stream
 
 
 class _Phase(Enum):

@@ -41,6 +41,10 @@ class Progress:
         elapsed_s = time.monotonic() - self.since_s
         return (self.frames_done - self.frames_found) / max(elapsed_s, 1e-6)
 
+    def eta_s(self, frames: int) -> float | None:
+        """Until all ``frames`` are done; None before the first one was."""
+        return (frames - self.frames_done) / self.fps if self.fps else None
+
 
 def opening_of(source: StereoSource, options: JobOptions) -> Opening:
     """How a sequence is stepped; lossless, so it gives way to live streams.

@@ -48,6 +48,9 @@ class JobShelf:
     def unfinished(self) -> list[Job]:
         return [job for job in self._jobs.values() if not job.ended]
 
+    def count(self, state: JobState) -> int:
+        return sum(job.state is state for job in self._jobs.values())
+
     def folder(self, job_id: str) -> Path:
         return self._store.folder(job_id)
 

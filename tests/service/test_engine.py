@@ -27,7 +27,8 @@ from vergence_service.batcher import StepBatcher
 from vergence_service.continuity import ContinuityLimits
 from vergence_service.engine import DepthEngine
 from vergence_service.metrics import Metrics
-from vergence_service.streams import Opening, StreamTable
+from vergence_service.stream_table import StreamTable
+from vergence_service.streams import Opening
 
 OPENING = Opening(StereoRig.from_rectified(RIG))
 
