@@ -1,0 +1,204 @@
+"""Recipes, what is written for them, and what the command says."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vergence_models.data.xrbench import rooms
+from vergence_models.data.xrbench.camera import Eye, StereoCamera
+from vergence_models.data.xrbench.motion import HeadPath
+from vergence_models.data.xrbench.recipe import KINDS, SETS, BadRecipe, Effects, Recipe
+from vergence_models.data.xrbench.things import Room
+from vergence_models.data.xrbench.writer import render_sequence
+from vergence_proto.layouts import open_source, read_pfm
+
+TINY = Recipe("studio", frames=1, width=32, height=24, samples=4, fps=20, baseline_m=0.07)
+
+
+def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "vergence_models.data.xrbench", *arguments],
+        capture_output=True, text=True, env=os.environ | environment, check=False,
+    )  # fmt: skip
+
+
+class TestRecipe:
+    def test_json_keeps_every_field(self) -> None:
+        recipe = Recipe("office", seed=7, speed=6.0, effects=Effects(glare=0.5))
+        assert Recipe.from_json(recipe.to_json(), Path("x.json")) == recipe
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ('{"room": "attic"}', "there are living_room, office"),
+            ('{"room": "office", "frames": 0}', "frames must be at least 1"),
+            ('{"room": "office", "baseline_m": -1}', "baseline_m must be positive"),
+            ('{"room": "office", "fov_deg": 180}', "fov_deg must lie in"),
+            ('{"room": "office", "height": 2}', "8x8"),
+            ('{"room": "office", "speed": -1}', "must not be negative"),
+            ('{"room": "office", "effects": {"glare": 2}}', "shares up to 1"),
+            ('{"room": "office", "effects": {"flicker_hz": NaN}}', "flicker_hz"),
+            ('{"room": "office", "lens": 1}', "unexpected keyword argument 'lens'"),
+            ('{"room": "office", "frames": "many"}', "frames must be of type int"),
+            ('{"room": "office", "effects": {"flicker": "no"}}', "effects.flicker"),
+            ("[]", "no recipe"),
+            ("{", "no recipe"),
+        ],
+    )
+    def test_what_cannot_be_rendered_is_refused_by_name(self, text: str, message: str) -> None:
+        with pytest.raises(BadRecipe, match=r"x\.json") as caught:
+            Recipe.from_json(text, Path("x.json"))
+        assert message in str(caught.value)
+
+    @pytest.mark.parametrize("name", SETS)
+    def test_sequences_of_a_set_have_folders_of_their_own(self, name: str) -> None:
+        names = [recipe.name for recipe in SETS[name]]
+        assert len(set(names)) == len(names)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+class TestRooms:
+    def test_a_seed_builds_one_room(self, kind: str) -> None:
+        def numbers(room: Room) -> bytes:
+            return b"".join(
+                mesh.moved(thing.world_from_thing).points.tobytes()
+                for thing in room.things
+                for _, mesh in thing.parts
+            )
+
+        assert numbers(rooms.build(kind, 3)) == numbers(rooms.build(kind, 3))
+        assert numbers(rooms.build(kind, 3)) != numbers(rooms.build(kind, 4))
+
+    def test_the_head_stays_in_the_room_and_out_of_things(self, kind: str) -> None:
+        room = rooms.build(kind, 1)
+        path = HeadPath(Recipe(kind), room)
+        eyes = np.array([path.world_from_left(t)[:3, 3] for t in np.arange(0, 60, 0.1)])
+        floor = next(thing for thing in room.things if thing.name == "floor")
+        low, high = floor.bounds_m()
+        assert (eyes[:, [0, 2]] > low[[0, 2]] + 0.1).all()
+        assert (eyes[:, [0, 2]] < high[[0, 2]] - 0.1).all()
+        points = np.concatenate(
+            [mesh.moved(thing.pose(0)).points for thing in room.things for _, mesh in thing.parts]
+        )
+        nearest_m = min(float(np.linalg.norm(points - eye, axis=1).min()) for eye in eyes[::10])
+        assert nearest_m > 0.25
+
+    def test_normals_are_unit_and_agree_with_how_faces_are_wound(self, kind: str) -> None:
+        for thing in rooms.build(kind, 1).things:
+            for _, mesh in thing.parts:
+                np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-9)
+                a, b, c = (mesh.points[mesh.faces[:, k]] for k in range(3))
+                wound = np.cross(b - a, c - a)
+                assert (np.einsum("fk,fk->f", wound, mesh.normals[mesh.faces[:, 0]]) >= 0).all()
+
+
+def test_at_six_times_the_speed_a_frame_is_six_frames_on() -> None:
+    room = rooms.build("office", 1)
+    calm, fast = (HeadPath(Recipe("office", speed=speed), room) for speed in (1.0, 6.0))
+    for frame in range(5):
+        np.testing.assert_allclose(
+            fast.world_from_left(fast.frame_time_s(frame)),
+            calm.world_from_left(calm.frame_time_s(6 * frame)),
+            atol=1e-12,
+        )
+
+
+def test_what_is_written_reads_as_sceneflow(tmp_path: Path) -> None:
+    recipe = dataclasses.replace(TINY, frames=2)
+    folder = render_sequence(recipe, tmp_path, variant="scalar_rgb")
+    assert folder == tmp_path / "frames_finalpass" / recipe.name
+    camera = StereoCamera(recipe, variant="scalar_rgb")
+    for which in ("clean", "final"):
+        source = open_source(f"sceneflow:{tmp_path}/frames_{which}pass/{recipe.name}")
+        assert (len(source), source.fps, source.metric) == (2, 20, True)
+        rig = source.rig.as_rectified()
+        assert rig is not None
+        assert rig.fx == pytest.approx(recipe.focal_px)
+        assert rig.baseline_m == pytest.approx(0.07)
+        for frame, read in enumerate(source):
+            truth = camera.truth(frame)
+            assert read.truth_px is not None
+            assert read.truth_mask is not None
+            assert read.frame.pose is not None
+            known = np.isfinite(truth.depth_m)
+            np.testing.assert_array_equal(read.truth_px[known], truth.disparity_px[known])
+            assert np.isnan(read.truth_px[~known]).all()
+            np.testing.assert_array_equal(read.truth_mask, ~truth.specular)
+            expected = camera.world_from_eye(frame / 20, Eye.LEFT)
+            np.testing.assert_allclose(read.frame.pose.world_from_left.matrix, expected, atol=1e-9)
+            if which == "clean":
+                np.testing.assert_array_equal(read.frame.left, camera.clean(frame, Eye.LEFT))
+                np.testing.assert_array_equal(read.frame.right, camera.clean(frame, Eye.RIGHT))
+    depth_m = read_pfm(tmp_path / "depth" / recipe.name / "left" / "0001.pfm")
+    np.testing.assert_array_equal(depth_m[known], truth.depth_m[known])
+
+
+def test_a_stopped_run_goes_on_and_keeps_what_is_there(tmp_path: Path) -> None:
+    render_sequence(TINY, tmp_path, passes=("clean",), variant="scalar_rgb")
+    first = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*0000*") if path.is_file()}
+    lost = tmp_path / "frames_cleanpass" / TINY.name / "left" / "0000.png"
+    assert len(first) > 8
+
+    told: list[int] = []
+    longer = dataclasses.replace(TINY, frames=2)
+    render_sequence(
+        longer, tmp_path, passes=("clean",), variant="scalar_rgb", on_frame=lambda: told.append(1)
+    )
+    assert len(told) == 2
+    assert {path: path.stat().st_mtime_ns for path in first} == first
+    assert (tmp_path / "disparity" / TINY.name / "right" / "0001.pfm").exists()
+
+    image = lost.read_bytes()
+    lost.unlink()
+    render_sequence(longer, tmp_path, passes=("clean",), variant="scalar_rgb")
+    assert lost.read_bytes() == image  # the same recipe, the same picture
+
+
+def test_another_recipe_may_not_mix_with_a_sequence_that_is_there(tmp_path: Path) -> None:
+    render_sequence(TINY, tmp_path, passes=("clean",), variant="scalar_rgb")
+    brighter = dataclasses.replace(TINY, samples=5)
+    with pytest.raises(BadRecipe, match="is another recipe"):
+        render_sequence(brighter, tmp_path, passes=("clean",), variant="scalar_rgb")
+
+
+class TestCommand:
+    def test_it_lists_every_sequence(self) -> None:
+        listed = run("--list", COLUMNS="200").stdout
+        assert all(recipe.name in listed for recipes in SETS.values() for recipe in recipes)
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            ((), "give one of --set, --recipe and --room"),
+            (("--set", "huge"), "no set 'huge'; there are benchmark, small, sample"),
+            (("--room", "attic"), "no room 'attic'"),
+            (("--room", "office"), "--out DIR is needed"),
+            (("--room", "office", "--size", "big"), "--size takes WxH"),
+            (("--room", "office", "--passes", "best", "--out", "x"), "no pass 'best'"),
+            (("--recipe", "none.json"), "none.json"),
+            (("--room", "office", "--out", "x", "--variant", "fast"), "no variant 'fast'"),
+        ],
+    )
+    def test_a_wrong_argument_is_named(
+        self, arguments: tuple[str, ...], message: str, tmp_path: Path
+    ) -> None:
+        if "x" in arguments:
+            arguments = tuple(str(tmp_path) if each == "x" else each for each in arguments)
+        said = run(*arguments)
+        assert said.returncode == 1
+        assert message in said.stderr
+        assert "Traceback" not in said.stderr
+
+    def test_without_llvm_it_says_what_to_install(self, tmp_path: Path) -> None:
+        arguments = ("--room", "studio", "--out", str(tmp_path), "--variant", "llvm_ad_rgb")
+        said = run(*arguments, DRJIT_LIBLLVM_PATH="/nowhere/libLLVM.so")
+        assert said.returncode == 1
+        assert "apt-get install libllvm19" in said.stderr
+        assert "Traceback" not in said.stderr
