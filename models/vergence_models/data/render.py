@@ -206,7 +206,8 @@ def _nearest_of(primitives: Primitives, candidates: Tensor, x: Tensor, y: Tensor
 
 def _develop(color: Tensor, shots: list[Shot]) -> Tensor:
     """Linear RGB [B, V, H, W, 3] to uint8: one exposure a clip, a soft shoulder, gamma."""
-    brightness = color[:, :1].mean(dim=(1, 2, 3, 4)).clamp(min=1e-3)
+    # Of the last left view: clips that end with the same view show it alike (see shots.Playback).
+    brightness = color[:, -2:-1].mean(dim=(1, 2, 3, 4)).clamp(min=1e-3)
     aim = column([s.scene.exposure for s in shots], color.device)
     exposed = color * (aim / brightness)[:, None, None, None, None]
     # The shoulder maps 4 to 1 and hardly touches what is below one half.

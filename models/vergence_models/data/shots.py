@@ -27,11 +27,14 @@ class Mix:
 
 @dataclass(frozen=True, slots=True)
 class Playback:
-    """A calm head's motion, played back faster: one scene and one path, whatever the speed."""
+    """A calm head's motion, played back faster: one scene, one path and one last view.
+
+    Only the past differs between clips of different speeds, so what the speed costs can be told
+    from what the camera happens to see.
+    """
 
     speed: float = 1.0
-    # So long a path the scene leaves room for: it is the same one for every clip within it.
-    path_s: float = 20.0
+    until_s: float = 8.0  # when the path ends; a clip must fit into it
 
 
 def draw_shot(
@@ -55,8 +58,9 @@ def draw_shot(
         start_from_left = reach = _poses(motion, times_s)
     else:
         motion = HeadMotion.draw(rng, speed=1.0)
-        start_from_left = _poses(motion, times_s * playback.speed)
-        reach = _poses(motion, np.arange(0, playback.path_s, 1 / rate_hz))
+        played_s = playback.until_s - (times_s[-1] - times_s) * playback.speed
+        start_from_left = _poses(motion, played_s)
+        reach = _poses(motion, np.arange(0, playback.until_s, 1 / rate_hz))
     travel_m = float(np.linalg.norm(reach[:, :3, 3], axis=1).max())
     turn = np.arccos(np.clip(reach[:, 2, 2], -1, 1)).max()
 

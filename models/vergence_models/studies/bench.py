@@ -13,7 +13,7 @@ from rich.progress import Progress
 from vergence_models.methods import Method
 from vergence_models.stepping import Footage, View
 from vergence_models.studies.contenders import Contender
-from vergence_models.studies.footage import Group, StudySettings, clips_at
+from vergence_models.studies.footage import Group, StudySettings, clips_at, whole_clips
 from vergence_models.tally import Tally
 from vergence_proto.geometry import RectifiedRig
 
@@ -35,25 +35,28 @@ class Bench:
         self._cache = cache
         self._workers = workers
         self._progress = progress
-        self._clips: dict[tuple[int, int], Group] = {}
+        self._groups: dict[int | None, Group] = {}
         self._tallies: dict[tuple[str, str], Tally] = {}
 
     def clips(self) -> Group:
-        """The held-out clips as they were filmed, whole."""
-        return self._group(1, self.settings.frames)
+        """The held-out clips as a calm head films them, rendered if need be."""
+        return self._group(None)
 
-    def short_clips(self, speed: int) -> Group:
-        """Shorter ones of the same scenes, played back at a speed."""
-        return self._group(speed, self.settings.short)
+    def clips_at(self, speed: int) -> Group:
+        """Shorter ones of the same scenes at a speed, judged by their last frame."""
+        return self._group(speed)
 
-    def _group(self, speed: int, frames: int) -> Group:
-        if (speed, frames) not in self._clips:
+    def _group(self, speed: int | None) -> Group:
+        if speed not in self._groups:
+            settings, cache, workers = self.settings, self._cache, self._workers
             self._progress.stop()  # rendering shows its own
-            self._clips[speed, frames] = clips_at(
-                speed, self.settings, self._cache, frames=frames, workers=self._workers
+            self._groups[speed] = (
+                whole_clips(settings, cache, workers=workers)
+                if speed is None
+                else clips_at(speed, settings, cache, workers=workers)
             )
             self._progress.start()
-        return self._clips[speed, frames]
+        return self._groups[speed]
 
     def tallies(self, group: Group, methods: Sequence[Method]) -> dict[str, Tally]:
         """Label -> figures over the group, for each method in the order given."""

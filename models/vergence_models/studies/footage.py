@@ -28,10 +28,14 @@ class Group:
     words: str  # for a reader of the tables
     frames: int  # at most so many of each sequence
     read: Callable[[], Iterable[Footage]]
+    last_only: bool = False  # judge the last frame alone
 
     def __iter__(self) -> Iterator[Footage]:
         for footage in self.read():
-            yield replace(footage, views=footage.views[: self.frames])
+            views = list(footage.views[: self.frames])
+            if self.last_only:
+                views[:-1] = [replace(view, truth_px=None) for view in views[:-1]]
+            yield replace(footage, views=views)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,28 +51,46 @@ class StudySettings:
     timed: int = 5  # frames of each method
 
 
-def clips_at(
-    speed: int, settings: StudySettings, cache: Path, *, frames: int, workers: int
-) -> Group:
-    """The scenes at one speed; renders what the cache lacks, clip by clip."""
+def clips_at(speed: int, settings: StudySettings, cache: Path, *, workers: int) -> Group:
+    """Short clips at one speed, judged by their last frame: the same view at every speed."""
     s = settings
-    looks = f"_{s.textures.name}" if s.textures else ""
-    folder = cache / f"{s.width}x{s.height}{looks}" / f"speed_{speed}_frames_{frames}"
-    config = GeneratorConfig(
-        width=s.width,
-        height=s.height,
-        frames=frames,
-        playback=Playback(speed),
-        textures=s.textures,
-    )
-    render_pool(folder, config, clips=s.clips, seed=SEED, shard_clips=1, workers=workers)
+    folder = rendered(Playback(speed), s.short, s, cache, workers=workers)
     return Group(
-        f"{speed}x, {frames} frames",
-        f"{s.clips} held-out clips of {frames} frames, {s.width}x{s.height}, from our generator "
+        f"clips, {speed}x",
+        f"the last of {s.short} frames of {s.clips} held-out clips, {s.width}x{s.height}, from our "
+        f"generator (seed {SEED}): the same view whatever the speed",
+        s.short,
+        lambda: footage_of_pool(folder, s.clips),
+        last_only=True,
+    )
+
+
+def whole_clips(settings: StudySettings, cache: Path, *, workers: int) -> Group:
+    """The clips as a calm head films them."""
+    s = settings
+    folder = rendered(Playback(), s.frames, s, cache, workers=workers)
+    return Group(
+        "clips",
+        f"{s.clips} held-out clips of {s.frames} frames, {s.width}x{s.height}, from our generator "
         f"(seed {SEED})",
-        frames,
+        s.frames,
         lambda: footage_of_pool(folder, s.clips),
     )
+
+
+def rendered(
+    playback: Playback, frames: int, settings: StudySettings, cache: Path, *, workers: int
+) -> Path:
+    """The folder of a pool in the cache; renders what it lacks, clip by clip."""
+    s = settings
+    looks = f"_{s.textures.name}" if s.textures else ""
+    speed = f"speed_{playback.speed:g}_frames_{frames}"
+    folder = cache / f"{s.width}x{s.height}{looks}" / speed
+    config = GeneratorConfig(
+        width=s.width, height=s.height, frames=frames, playback=playback, textures=s.textures
+    )
+    render_pool(folder, config, clips=s.clips, seed=SEED, shard_clips=1, workers=workers)
+    return folder
 
 
 def group_on_disk(spec: str, frames: int) -> Group:

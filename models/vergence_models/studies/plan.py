@@ -98,15 +98,15 @@ def warp_ablation(bench: Bench) -> Table:
             variants[f"{contender.name}, no state, {counted(count)}"] = method
     cells: dict[str, dict[str, float]] = {label: {} for label in variants}
     for speed in WARP_SPEEDS:
-        found = bench.tallies(bench.short_clips(speed), list(variants.values()))
+        found = bench.tallies(bench.clips_at(speed), list(variants.values()))
         for label, method in variants.items():
             cells[label][f"{speed}x"] = epe(found[method.label])
     return Table(
         name="warp",
         title="Warp or no warp, at 1x and 6x",
-        text=f"EPE in px on {bench.short_clips(1).words}, the same scenes and paths at both "
-        "speeds; one warm iteration a frame. *Not moved*: the same weights are told that the "
-        "camera stands still, which leaves the state in place. *No state*: every frame cold.",
+        text=f"EPE in px on {bench.clips_at(1).words}; one warm iteration a frame. *Not moved*: "
+        "the same weights are told that the camera stands still, which leaves the state in place. "
+        "*No state*: every frame cold.",
         columns={"1x": "1x", "6x": "6x", "loss": "loss at 6x, %"},
         rows=[Row(label, values | {"loss": loss_pct(values)}) for label, values in cells.items()],
         training=training_of(bench.contenders),
@@ -129,13 +129,13 @@ def movement_speed(bench: Bench) -> Table:
     methods += sgbm_methods()[:1]
     cells: dict[str, dict[str, float]] = {method.label: {} for method in methods}  # each once
     for speed in SPEEDS:
-        for label, tally in bench.tallies(bench.short_clips(speed), methods).items():
+        for label, tally in bench.tallies(bench.clips_at(speed), methods).items():
             cells[label][f"{speed}x"] = epe(tally)
     return Table(
         name="speed",
         title="Movement speed, 1x to 20x",
-        text=f"EPE in px on {bench.short_clips(1).words}. A calm head's path (about 10 degrees "
-        "and 10 cm a second) is played back faster: the same scenes, the same path.",
+        text=f"EPE in px on {bench.clips_at(1).words}. A calm head's path (about 10 degrees and 10 "
+        "cm a second) is played back faster. Methods without a past are the same at every speed.",
         columns={f"{speed}x": f"{speed}x" for speed in SPEEDS},
         rows=[Row(label, values) for label, values in cells.items()],
         training=training_of(bench.contenders),
@@ -156,12 +156,12 @@ def pose_noise(bench: Bench, levels: Sequence[int] = range(11)) -> Table:
         if not contender.warps:
             continue
         told = {level: told_noise(warm, level) for level in levels}
-        found = bench.tallies(bench.short_clips(1), list(told.values()))
+        found = bench.tallies(bench.clips_at(1), list(told.values()))
         cells[warm.label] = {str(k): epe(found[method.label]) for k, method in told.items()}
     return Table(
         name="noise",
         title="Noise of the poses, levels 0 to 10",
-        text=f"EPE in px on {bench.short_clips(1).words}. At level k every motion from one frame "
+        text=f"EPE in px on {bench.clips_at(1).words}. At level k every motion from one frame "
         f"to the next is off by k x {NOISE_DEG} degrees and k x {1e3 * NOISE_M:g} mm, in random "
         "directions that are the same at each level. Networks without a warp see no poses.",
         columns={str(level): str(level) for level in levels},
