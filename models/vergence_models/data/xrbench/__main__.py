@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import shlex
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -13,10 +13,18 @@ from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
 from rich.table import Table
 
 from vergence_models.data.xrbench.recipe import KINDS, SETS, BadRecipe, Recipe
+from vergence_models.data.xrbench.sheet import contact_sheet
 from vergence_models.data.xrbench.tracer import VARIANTS, NoRenderer
-from vergence_models.data.xrbench.writer import PASSES, render_sequence
+from vergence_models.data.xrbench.writer import PASSES, encode_png, render_sequence
+from vergence_proto.layouts import LayoutError
 
-_DEFAULTS = Recipe(KINDS[0])
+
+def _option(field: str, text: str) -> typer.models.OptionInfo:
+    """Of a field that every chosen recipe takes from the command line, where it is given."""
+    option: typer.models.OptionInfo = typer.Option(
+        help=f"{text} The recipe's own ({getattr(Recipe(KINDS[0]), field):g}) if not given."
+    )
+    return option
 
 
 def main(
@@ -28,17 +36,20 @@ def main(
         list[Path] | None, typer.Option(help="A recipe's JSON, as recipes/ of a set holds them.")
     ] = None,
     room: Annotated[str | None, typer.Option(help=f"One of {', '.join(KINDS)}.")] = None,
-    seed: int = _DEFAULTS.seed,
-    frames: int | None = None,
+    seed: Annotated[int | None, _option("seed", "Of the room and the head's path.")] = None,
+    frames: Annotated[int | None, _option("frames", "Of each sequence.")] = None,
     size: Annotated[str | None, typer.Option(metavar="WxH", help="640x480 if not given.")] = None,
-    speed: Annotated[float, typer.Option(help="Of the head; 1 is calm, 20 violent.")] = 1.0,
-    fps: float = _DEFAULTS.fps,
-    fov: Annotated[float, typer.Option(help="Degrees across the width.")] = _DEFAULTS.fov_deg,
-    baseline: Annotated[float, typer.Option(help="Metres.")] = _DEFAULTS.baseline_m,
-    samples: Annotated[int | None, typer.Option(help="Light paths a pixel.")] = None,
+    speed: Annotated[float | None, _option("speed", "Of the head; 20 is violent.")] = None,
+    fps: Annotated[float | None, _option("fps", "Frames a second.")] = None,
+    fov: Annotated[float | None, _option("fov_deg", "Degrees across the width.")] = None,
+    baseline: Annotated[float | None, _option("baseline_m", "Metres.")] = None,
+    samples: Annotated[int | None, _option("samples", "Light paths a pixel.")] = None,
     passes: Annotated[str, typer.Option(help="Which images: clean, final or both.")] = "both",
     variant: Annotated[
         str | None, typer.Option(help=f"Of Mitsuba: {', '.join(VARIANTS)}; LLVM's if not given.")
+    ] = None,
+    sheet: Annotated[
+        Path | None, typer.Option(help="A PNG of the last sequence's first frame, all truths.")
     ] = None,
     list_: Annotated[
         bool, typer.Option("--list", help="Tell what the sets hold, and stop.")
@@ -54,47 +65,44 @@ def main(
         console.print(_table())
         return
     try:
-        recipes = _chosen(set_, recipe or [], room, seed, speed, fps, fov, baseline)
-        recipes = [_adapted(each, frames, size, samples) for each in recipes]
+        width, height = _parsed(size)
+        fields = {
+            "seed": seed, "frames": frames, "width": width, "height": height, "speed": speed,
+            "fps": fps, "fov_deg": fov, "baseline_m": baseline, "samples": samples,
+        }  # fmt: skip
+        given: dict[str, Any] = {name: x for name, x in fields.items() if x is not None}
+        recipes = [dataclasses.replace(each, **given) for each in _chosen(set_, recipe or [], room)]
         chosen = PASSES if passes == "both" else (passes,)
         if out is None or not set(chosen) <= set(PASSES):
             raise BadRecipe("--out DIR is needed" if out is None else f"no pass {passes!r}")
         _render(recipes, out, chosen, variant, console)
-    except (BadRecipe, NoRenderer) as error:
+        if sheet:
+            sheet.write_bytes(encode_png(contact_sheet(out, recipes[-1].name, 0)))
+    except (BadRecipe, NoRenderer, LayoutError, OSError) as error:
         raise SystemExit(f"error: {error}") from None
     except KeyboardInterrupt:
         raise SystemExit("stopped; the same command goes on from here") from None
 
 
-def _chosen(
-    set_: str | None, files: list[Path], room: str | None, seed: int, speed: float, fps: float,
-    fov: float, baseline: float,
-) -> list[Recipe]:  # fmt: skip
+def _chosen(set_: str | None, files: list[Path], room: str | None) -> list[Recipe]:
     if (set_ is not None) + bool(files) + (room is not None) != 1:
         raise BadRecipe("give one of --set, --recipe and --room (or --list)")
-    if set_ is not None:
-        if set_ not in SETS:
-            raise BadRecipe(f"no set {set_!r}; there are {', '.join(SETS)}")
-        return list(SETS[set_])
     if room is not None:
-        return [Recipe(room, seed=seed, speed=speed, fps=fps, fov_deg=fov, baseline_m=baseline)]
-    try:
+        return [Recipe(room)]
+    if set_ is None:
         return [Recipe.from_json(path.read_text("utf-8"), path) for path in files]
-    except OSError as error:
-        raise BadRecipe(str(error)) from None
+    if set_ not in SETS:
+        raise BadRecipe(f"no set {set_!r}; there are {', '.join(SETS)}")
+    return list(SETS[set_])
 
 
-def _adapted(recipe: Recipe, frames: int | None, size: str | None, samples: int | None) -> Recipe:
-    if frames is not None:
-        recipe = dataclasses.replace(recipe, frames=frames)
-    if samples is not None:
-        recipe = dataclasses.replace(recipe, samples=samples)
+def _parsed(size: str | None) -> tuple[int | None, int | None]:
     if size is None:
-        return recipe
+        return None, None
     width, _, height = size.partition("x")
     if not (width.isdecimal() and height.isdecimal()):
         raise BadRecipe(f"--size takes WxH, such as 640x480, got {size!r}")
-    return dataclasses.replace(recipe, width=int(width), height=int(height))
+    return int(width), int(height)
 
 
 def _render(

@@ -90,7 +90,7 @@ def _files(camera: StereoCamera, frame: int, passes: tuple[str, ...]) -> Mapping
     name = camera.recipe.name
     shoot = {"clean": camera.clean, "final": camera.final}
     images = {
-        _image_path(name, each, eye, frame): _png(shoot[each](frame, eye))
+        _image_path(name, each, eye, frame): encode_png(shoot[each](frame, eye))
         for eye in (Eye.RIGHT, Eye.LEFT)
         for each in passes
     }
@@ -109,9 +109,9 @@ def _truth_files(truth: FrameTruth, name: str, frame: int) -> Mapping[Path, byte
             _flow_pfm(truth.into_future),
         flow / "into_past" / "left" / f"OpticalFlowIntoPast_{frame:04d}_L.pfm":
             _flow_pfm(truth.into_past),
-        "normals" / still / picture: _png(stored_normals),
-        "object_index" / still / picture: _png(truth.label),
-        "specular" / still / picture: _png(truth.specular.astype(np.uint8) * 255),
+        "normals" / still / picture: encode_png(stored_normals),
+        "object_index" / still / picture: encode_png(truth.label),
+        "specular" / still / picture: encode_png(truth.specular.astype(np.uint8) * 255),
         Path("object_boxes") / name / f"{frame:04d}.json": json.dumps(truth.boxes).encode(),
     }  # fmt: skip
 
@@ -141,7 +141,8 @@ def _words(world_from_camera: Matrix) -> str:
     return " ".join(f"{x:.12g}" for x in np.ravel(world_from_camera @ _BLENDER_FROM_OPENCV))
 
 
-def _png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
+def encode_png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
+    """Of grey [H, W] or RGB [H, W, 3]."""
     turned = image[..., ::-1] if image.ndim == 3 else image
     done, data = cv2.imencode(".png", np.ascontiguousarray(turned))
     assert done, f"OpenCV encodes every image of {image.dtype} {image.shape}"
