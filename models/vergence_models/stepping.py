@@ -150,7 +150,8 @@ class OnnxNetwork(SteppedNetwork):
         self.card = load_model_card(weights, name)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
-        options.inter_op_num_threads = 1
+        # As the service sets it: threads that always spin cost the other core's time.
+        options.add_session_config_entry("session.intra_op.spin_duration_us", "20")
         self._sessions = {
             count: onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
             for count, path in self.card.graphs.items()

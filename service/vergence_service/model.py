@@ -167,9 +167,9 @@ class OnnxStereoModel:
         # Planning the reuse of buffers took a second of a long graph's start and saved no memory:
         # the arena gives freed buffers out again without a plan, and steps are as quick.
         self._options.enable_mem_reuse = False
-        self._options.add_session_config_entry(
-            "session.intra_op.allow_spinning", "1" if allow_spinning else "0"
-        )
+        if not allow_spinning:
+            # As long as the next operator of a step may take to come, never between steps.
+            self._options.add_session_config_entry("session.intra_op.spin_duration_us", "20")
         self._next = [tensor.output_name for tensor in self._card.state]
         self._sessions: dict[int, InferenceSession] = {}
 

@@ -2,9 +2,10 @@
 
     python tests/benchmarks/model_speed.py --json FILE
 
-The whole warm graph, 640x480, batch 1, one iteration, two onnxruntime threads; SGBM 3-way with its
-holes filled, at full and at half size. The methods take turns, so that a busy moment of the machine
-hits all of them. Times are medians in milliseconds; CPU time counts every thread of the process.
+A warm step of the service's model, 640x480, batch 1, one iteration, two onnxruntime threads, with
+the settings that the service has by default; SGBM 3-way with its holes filled, at full and at half
+size. The methods take turns, so that a busy moment of the machine hits all of them. Times are
+medians in milliseconds; CPU time counts every thread of the process.
 """
 
 import argparse
@@ -19,10 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vergence_models.sgbm import sgbm_disparity
-from vergence_models.stepping import OnnxNetwork
+from vergence_proto.geometry import Pose, RectifiedRig
+from vergence_service.model import OnnxStereoModel, Step, View, packaged_weights_dir
+from vergence_service.settings import ModelSettings
 
 HEIGHT, WIDTH = 480, 640
-WEIGHTS = Path(__file__).parents[2] / "models" / "vergence_models" / "weights"
+RIG = RectifiedRig(WIDTH, HEIGHT, 500.0, 500.0, 319.5, 319.5, 239.5, 0.1)
 
 
 def textured_pair() -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
@@ -63,19 +66,24 @@ def measure(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--weights", type=Path, default=WEIGHTS)
+    parser.add_argument("--weights", type=Path, default=packaged_weights_dir())
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=40)
     given = parser.parse_args()
     left, right = textured_pair()
-    network = OnnxNetwork(given.weights, "lite", threads=given.threads)
-    still = np.eye(4, dtype=np.float32)[None]
-    _, _, state = network.run(
-        left[None], right[None], still, network.cold_state(HEIGHT, WIDTH), max(network.card.graphs)
+    model = OnnxStereoModel(
+        given.weights,
+        "lite",
+        providers=["cpu"],
+        threads=given.threads,
+        allow_spinning=ModelSettings().allow_spinning,
     )
+    view = View(left, right, RIG, capture_ns=0, world_from_left=Pose.identity())
+    (cold,) = model.step([Step(view, None, max(model.card.graphs))])
+    warm = [Step(view, cold.state, 1)]
     found = measure(
         {
-            "lite": lambda: network.run(left[None], right[None], still, state, 1),
+            "lite": lambda: model.step(warm),
             "sgbm_full": lambda: sgbm_disparity(left, right),
             "sgbm_half": lambda: sgbm_disparity(left, right, scale=0.5),
         },
