@@ -2,6 +2,7 @@ r"""``python -m vergence_models.studies --json FILE``: the paper's studies, on o
 
     python -m vergence_models.studies --json out/studies.json
     python -m vergence_models.studies --json out/studies.json --studies times     # that table anew
+    python -m vergence_models.studies --json out/studies.json --studies --data vergence:DIR
     python -m vergence_models.studies --json FILE --weights DIR DIR --run runs/lite \
         --data sceneflow:BENCH --kitti vergence:DIR
 
@@ -53,7 +54,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     )
     add = parser.add_argument
     add("--json", type=Path, required=True, help="results; Markdown and PNGs go beside it")
-    add("--studies", nargs="+", choices=list(STUDIES), default=None, help="by default all")
+    add("--studies", nargs="*", metavar="NAME", help=f"of {', '.join(STUDIES)}; by default all")
     add("--weights", type=Path, nargs="+", default=[WEIGHTS], help="folders with a manifest")
     add("--run", type=Path, nargs="*", default=[], help="training runs, computed by PyTorch")
     add("--data", nargs="*", default=[], help="KIND:PATH, each a table of its own")
@@ -65,18 +66,23 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     add("--quick", action="store_true", help=f"{QUICK.clips} clips of {QUICK.frames} frames")
     add("--workers", type=int, default=2, help="processes that render")
     add("--threads", type=int, default=2, help="of each network")
-    return parser.parse_args(arguments)
+    given = parser.parse_args(arguments)
+    given.studies = list(STUDIES) if given.studies is None else given.studies
+    unknown = set(given.studies) - set(STUDIES)
+    if unknown:
+        parser.error(f"no study {', '.join(sorted(unknown))}; there are {', '.join(STUDIES)}")
+    return given
 
 
 def chosen(given: argparse.Namespace, frames: int) -> dict[str, Study]:
     """Name -> study, sources on disk included."""
     extra: dict[str, Study] = {}
     for spec in given.data:
-        name = f"data_{Path(spec.partition('?')[0]).stem}"
+        name = f"data_{Path(spec.partition(':')[2].partition('?')[0]).name}"
         extra[name] = partial(on_data, group=group_on_disk(spec, frames), name=name)
     if given.kitti:
         extra["kitti"] = partial(kitti, group=group_on_disk(given.kitti, frames))
-    return {name: STUDIES[name] for name in given.studies or STUDIES} | extra
+    return {name: STUDIES[name] for name in STUDIES if name in given.studies} | extra
 
 
 def report(tables: dict[str, Table], missing: list[str], path: Path) -> None:
