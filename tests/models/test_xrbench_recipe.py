@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from vergence_models.data.xrbench import rooms
+from vergence_models.data.xrbench import rooms, truths
 from vergence_models.data.xrbench.camera import Eye, StereoCamera
 from vergence_models.data.xrbench.motion import HeadPath
 from vergence_models.data.xrbench.recipe import KINDS, SETS, BadRecipe, Effects, Recipe
+from vergence_models.data.xrbench.sheet import contact_sheet
 from vergence_models.data.xrbench.things import Room
 from vergence_models.data.xrbench.writer import render_sequence
-from vergence_proto.layouts import open_source, read_pfm
+from vergence_proto.layouts import open_source
 
 TINY = Recipe("studio", frames=1, width=32, height=24, samples=4, fps=20, baseline_m=0.07)
 
@@ -136,8 +140,40 @@ def test_what_is_written_reads_as_sceneflow(tmp_path: Path) -> None:
             if which == "clean":
                 np.testing.assert_array_equal(read.frame.left, camera.clean(frame, Eye.LEFT))
                 np.testing.assert_array_equal(read.frame.right, camera.clean(frame, Eye.RIGHT))
-    depth_m = read_pfm(tmp_path / "depth" / recipe.name / "left" / "0001.pfm")
-    np.testing.assert_array_equal(depth_m[known], truth.depth_m[known])
+    sheet = contact_sheet(tmp_path, recipe.name, 0)
+    assert sheet.shape == (2 * 24, 3 * 32, 3)
+    np.testing.assert_array_equal(sheet[:24, :32], camera.clean(0, Eye.LEFT))
+
+
+def test_every_file_of_a_frame_holds_what_is_known_of_it(tmp_path: Path) -> None:
+    render_sequence(TINY, tmp_path, passes=("clean",), variant="scalar_rgb")
+    camera = StereoCamera(TINY, variant="scalar_rgb")
+    truth, name = camera.truth(0), TINY.name
+
+    def picture(kind: str) -> NDArray[np.generic]:
+        path = tmp_path / kind / name / "left" / "0000.png"
+        return np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
+
+    def pfm(path: str) -> NDArray[np.float32]:
+        """By OpenCV's reader, not ours."""
+        return np.asarray(cv2.imread(str(tmp_path / path), cv2.IMREAD_UNCHANGED))
+
+    np.testing.assert_array_equal(picture("object_index"), truth.label)
+    np.testing.assert_array_equal(picture("specular") > 0, truth.specular)
+    normals = picture("normals")[..., ::-1].astype(float) / 32767 - 1
+    np.testing.assert_allclose(normals, truth.normals, atol=2e-5)
+    for side, expected in (("left", truth.disparity_px), ("right", truth.right_disparity_px)):
+        np.testing.assert_array_equal(pfm(f"disparity/{name}/{side}/0000.pfm"), expected)
+    np.testing.assert_array_equal(pfm(f"depth/{name}/left/0000.pfm"), truth.depth_m)
+    for way, motion in (("Future", truth.into_future), ("Past", truth.into_past)):
+        file = f"into_{way.lower()}/left/OpticalFlowInto{way}_0000_L.pfm"
+        flow = pfm(f"optical_flow/{name}/{file}")[..., ::-1]  # OpenCV turns channels around
+        np.testing.assert_array_equal(flow[..., :2], motion.flow_px)
+        assert (flow[..., 2] == 0).all()
+    boxes = tmp_path / "object_boxes" / name / "0000.json"
+    assert json.loads(boxes.read_text()) == truth.boxes
+    rays = np.load(tmp_path / "rays" / name / "left.npy")
+    np.testing.assert_array_equal(rays, truths.rays(camera.optics))
 
 
 def test_a_stopped_run_goes_on_and_keeps_what_is_there(tmp_path: Path) -> None:

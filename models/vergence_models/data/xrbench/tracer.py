@@ -278,7 +278,7 @@ def _mitsuba(variant: str | None) -> ModuleType:
     advice = (
         "llvm_ad_rgb needs LLVM 19 (Debian: apt-get install libllvm19; elsewhere set "
         "DRJIT_LIBLLVM_PATH), cuda_ad_rgb an NVIDIA GPU; scalar_rgb needs nothing, and takes "
-        "about three times as long as LLVM's"
+        "about eight times as long as LLVM's"
     )
     try:
         mitsuba.set_variant(name)
