@@ -11,7 +11,7 @@ import torch
 
 from vergence_models.data.clips import StereoClips
 from vergence_models.data.render import render
-from vergence_models.data.shots import Playback, draw_shot
+from vergence_models.data.shots import Mix, Playback, draw_shot
 from vergence_models.data.textures import TextureBank
 from vergence_models.data.truth import SurfaceTruth, surface_truth
 from vergence_models.data.views import Shot
@@ -26,6 +26,7 @@ class GeneratorConfig:
     frames: int = 4
     rate_hz: float = 30.0
     largest_zoom: float = 1.0  # clips are windows of a camera up to so many times as wide and high
+    mix: Mix | None = None  # shares of the kinds of scene; None: those of training
     playback: Playback | None = None  # the camera's speed; None: drawn anew for each clip
     textures: Path | None = None  # a folder of photographs; None: procedural textures only
     bank_seed: int = 0
@@ -71,6 +72,7 @@ class ClipGenerator:
             height=height,
             frames=c.frames,
             rate_hz=c.rate_hz,
+            mix=c.mix,
             playback=c.playback,
         )
         x, y = (int(rng.integers(spare + 1)) for spare in (width - c.width, height - c.height))
