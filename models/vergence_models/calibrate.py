@@ -19,7 +19,6 @@ from vergence_models.data.clips import StereoClips
 from vergence_models.data.pool import ClipPool
 from vergence_models.motion import uvd_transforms
 from vergence_models.quantize import Scale, copy_of, plan, quantized
-from vergence_models.tiers import AnyNetwork
 from vergence_models.validation import filmed
 from vergence_proto.model_io import DISPARITY, LEFT, RIGHT, UVD_CURR_FROM_PREV, StateTensor
 
@@ -35,12 +34,18 @@ class QuantizationError(RuntimeError):
     """An int8 graph loses too much."""
 
 
-def make_int8(paths: Mapping[int, Path], network: AnyNetwork, pool: ClipPool) -> dict[str, object]:
+def make_int8(
+    paths: Mapping[int, Path],
+    states: Sequence[StateTensor],
+    pool: ClipPool,
+    *,
+    max_disparity_px: float,
+) -> dict[str, object]:
     """Replace float graphs, by iteration count, with int8 ones; returns the story for the manifest.
 
-    Raises QuantizationError if that costs the smallest graph more than :data:`MAX_LOSS`.
+    Raises QuantizationError if that costs the smallest graph more than :data:`MAX_LOSS`, before
+    any is replaced.
     """
-    states = network.state_tensors
     clips = filmed(pool, range(RANGE_CLIPS))
     story: dict[str, object] = {}
     for count, path in sorted(paths.items()):
@@ -48,8 +53,7 @@ def make_int8(paths: Mapping[int, Path], network: AnyNetwork, pool: ClipPool) ->
         what = plan(model)
         int8 = quantized(model, what, find_scales(model, what.measured, states, clips))
         if not story:
-            limit = network.config.max_disparity_px
-            before, after = (epe_px(each, states, pool, limit) for each in (model, int8))
+            before, after = (epe_px(each, states, pool, max_disparity_px) for each in (model, int8))
             if not after < MAX_LOSS * before:
                 raise QuantizationError(
                     f"{path}: EPE {after:.3f} px as int8, {before:.3f} px before; "
@@ -58,7 +62,7 @@ def make_int8(paths: Mapping[int, Path], network: AnyNetwork, pool: ClipPool) ->
             story = {
                 "convolutions": len(what.convolutions),
                 "range_clips": RANGE_CLIPS,
-                "measured_clips": MEASURED_CLIPS,
+                "measured_clips": min(MEASURED_CLIPS, len(pool) - RANGE_CLIPS),
                 "iterations": count,
                 "epe_px": round(after, 4),
                 "float_epe_px": round(before, 4),
@@ -112,14 +116,15 @@ def find_scales(
 
 
 def epe_px(
-    model: ModelProto, states: Sequence[StateTensor], pool: ClipPool, limit_px: float
+    model: ModelProto, states: Sequence[StateTensor], pool: ClipPool, max_disparity_px: float
 ) -> float:
-    """Mean error of a graph's disparity, in px, where the truth is below the limit."""
+    """Mean error of a graph's disparity, in px, where the truth is known and small enough."""
     errors = []
-    for start in range(RANGE_CLIPS, RANGE_CLIPS + MEASURED_CLIPS, BATCH):
-        clips = filmed(pool, range(start, start + BATCH))
+    last = min(RANGE_CLIPS + MEASURED_CLIPS, len(pool))
+    for start in range(RANGE_CLIPS, last, BATCH):
+        clips = filmed(pool, range(start, min(start + BATCH, last)))
         for frame, found in enumerate(steps(model, states, clips, [DISPARITY])):
             truth = clips.disparity_px[:, frame].numpy()
-            known = (truth > 0) & (truth < limit_px)
+            known = (truth > 0) & (truth < max_disparity_px)
             errors.append(np.abs(found[DISPARITY] - truth)[known].mean())
     return float(np.mean(errors))

@@ -123,7 +123,12 @@ def export_run(run: Run, config: Config, out: Path, *, int8_clips: ClipPool | No
         worst = check_parity(network, count, path)
         log.info("%s: 99 %% of pixels within %.1e px of PyTorch", path.name, worst)
     if int8_clips is not None:
-        entry["int8"] = make_int8(paths, network, int8_clips)
+        entry["int8"] = make_int8(
+            paths,
+            network.state_tensors,
+            int8_clips,
+            max_disparity_px=run.network.max_disparity_px,
+        )
         log.info("int8: %s", entry["int8"])
     entry |= {
         "graphs": {str(count): named(path) for count, path in paths.items()},

@@ -19,6 +19,8 @@ Array = NDArray[np.generic]
 LAYOUT_OPS = frozenset({"Reshape", "Resize", "Squeeze", "Transpose", "Unsqueeze"})
 # What bytes that start at 0 do by themselves. A clip's upper end is then the range's.
 ACTIVATIONS = frozenset({"Relu", "Clip"})
+# The quick kernel makes no fewer outputs; what was not asked for is cut off.
+KERNEL_OUTPUTS = 16
 # A convolution of an image would gain little, and its differences are what matching starts from.
 MIN_CHANNELS = 4
 
@@ -107,20 +109,30 @@ class _Writer:
         self._plan = what
         self._scales = {name: scales[source] for name, source in what.source.items()}
         self._old = {tensor.name: tensor for tensor in model.graph.initializer}
+        self._outputs = {output.name for output in model.graph.output}
         self._new: dict[str, TensorProto] = {}
         self._nodes: list[NodeProto] = []
         self._reading: dict[str, str] = {}  # tensor -> what its readers read instead
+        self._asked: dict[str, int] = {}  # result of a widened convolution -> channels asked for
 
     def send_as_bytes(self, name: str) -> None:
         """If the plan says so."""
         if name not in self._scales:
             return
         scale = self._scales[name]
-        by = [self._constant(f"{name}.step", scale.step), self._constant(f"{name}.zero", scale.zero)]
+        by = [
+            self._constant(f"{name}.step", scale.step),
+            self._constant(f"{name}.zero", scale.zero),
+        ]
         real = self._plan.absorbed.get(name, name)
         self._add("QuantizeLinear", [real, *by], f"{name}.bytes")
         # The contract's outputs keep their name, and what they were before the bytes.
-        self._reading[name] = self._add("DequantizeLinear", [f"{name}.bytes", *by], f"{name}.real")
+        reading = self._add("DequantizeLinear", [f"{name}.bytes", *by], f"{name}.real")
+        if real in self._asked:
+            ends = {"start": [0], "end": [self._asked[real]], "axis": [1]}
+            cut = [self._constant(f"{name}.{end}", np.array(ends[end], np.int64)) for end in ends]
+            reading = self._add("Slice", [reading, *cut], f"{name}.asked")
+        self._reading[name] = reading
 
     def copy(self, node: NodeProto) -> None:
         copied = NodeProto.FromString(node.SerializeToString())
@@ -142,19 +154,29 @@ class _Writer:
 
     def _weights(self, node: NodeProto) -> list[str]:
         """Weight and bias of a convolution as int8 and int32."""
-        real = numpy_helper.to_array(self._old[node.input[1]])
-        step = np.maximum(np.abs(real).max(axis=(1, 2, 3)) / 127, 1e-12).astype(np.float32)
-        weight = np.rint(real / step[:, None, None, None]).astype(np.int8)
-        names = [self._dequantized(f"{node.output[0]}.weight", weight, step)]
+        result, into = node.output[0], float(self._scales[node.input[0]].step)
+        weight = numpy_helper.to_array(self._old[node.input[1]]).astype(np.float64)
+        bias = np.zeros(len(weight))
         if len(node.input) > 2:
-            step = step * self._scales[node.input[0]].step
-            real = numpy_helper.to_array(self._old[node.input[2]])
-            bias = np.clip(np.rint(real / step), -(2**31 - 1), 2**31 - 1).astype(np.int32)
-            names.append(self._dequantized(f"{node.output[0]}.bias", bias, step))
-        return names
+            bias += numpy_helper.to_array(self._old[node.input[2]])
+        spare = KERNEL_OUTPUTS - len(weight)
+        if spare > 0 and weight.shape[2] > 1 and result not in self._outputs:
+            self._asked[result] = len(weight)
+            weight = np.pad(weight, ((0, spare), (0, 0), (0, 0), (0, 0)))
+            bias = np.pad(bias, (0, spare))
+        # Fine enough for the weights, and coarse enough for the bias, in 32 bits.
+        step = np.maximum(np.abs(weight).max(axis=(1, 2, 3)) / 127, np.abs(bias) / into / 2**30)
+        step = np.maximum(step, 1e-12).astype(np.float32)
+        weight = np.rint(weight / step[:, None, None, None])
+        bias = np.rint(bias / (step * into))
+        return [
+            self._dequantized(f"{result}.weight", weight.astype(np.int8), step),
+            self._dequantized(f"{result}.bias", bias.astype(np.int32), step * into),
+        ]
 
     def _dequantized(self, name: str, values: Array, step: Array) -> str:
-        parts = {"bytes": values, "step": step, "zero": np.zeros(step.shape, values.dtype)}
+        zero = np.zeros(step.shape, values.dtype)
+        parts = {"bytes": values, "step": step.astype(np.float32), "zero": zero}
         inputs = [self._constant(f"{name}.{part}", array) for part, array in parts.items()]
         return self._add("DequantizeLinear", inputs, f"{name}.real", axis=0)
 
@@ -163,7 +185,9 @@ class _Writer:
         return name
 
     def _add(self, operator: str, inputs: list[str], output: str, **attributes: int) -> str:
-        self._nodes.append(helper.make_node(operator, inputs, [output], **attributes))
+        node = helper.make_node(operator, inputs, [output])
+        node.attribute.extend(helper.make_attribute(*each) for each in attributes.items())
+        self._nodes.append(node)
         return output
 
 
