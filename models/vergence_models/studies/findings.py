@@ -55,7 +55,8 @@ def warp_findings(cells: Mapping[str, Mapping[str, float]]) -> list[str]:
         if label.endswith("state moved"):
             told = f"the paper's shape: under +20 %: {verdict(lost < 20)}"
         elif label.endswith("state not moved"):
-            told = f"the paper's shape: over +60 %: {verdict(lost > 60)}"
+            leans = "holds" if lost > 60 else "this network leans less on its past"
+            told = f"the paper's shape: over +60 %: {leans}"
         else:
             continue
         lines.append(f"{label}: {lost:+.0f} % EPE at 6x; {told}.")
