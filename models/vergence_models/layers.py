@@ -154,6 +154,21 @@ def conv(inputs: int, outputs: int, *, kernel: int = 3, stride: int = 1) -> nn.C
     return layer
 
 
+def joint(layer: nn.Conv2d, *parts: Tensor) -> Tensor:
+    """``layer(torch.cat(parts, dim=1))`` without the copy: the sum of a convolution of each part.
+
+    Quantised, each part has a scale of its own, and one that comes from a convolution stays bytes.
+    """
+    weights = layer.weight.split([part.shape[1] for part in parts], dim=1)
+    biases = (layer.bias, *(None for _ in parts[1:]))
+    return added(
+        [
+            F.conv2d(part, weight, bias, layer.stride, layer.padding)
+            for part, weight, bias in zip(parts, weights, biases, strict=True)
+        ]
+    )
+
+
 def silent(layer: nn.Conv2d) -> nn.Conv2d:
     """The same layer with zero output: what it adds has to be learned."""
     nn.init.zeros_(layer.weight)
@@ -201,23 +216,26 @@ class ConvexUpsampler(nn.Module):
     def forward(self, features: Tensor, disparity: Tensor) -> Tensor:
         """``features`` [B, C, h, w], ``disparity`` [B, 1, h, w] to [B, 4 h, 4 w]."""
         batch, _, height, width = disparity.shape
+        # The parameters' order is (quadrant, cell, pixel), each (y, x). With the cells first and
+        # the pixels in the order they are wanted in, a cell's shares are one block of channels.
+        assert self.mask.bias is not None
+        both = torch.cat((self.mask.weight.flatten(1), self.mask.bias[:, None]), dim=1)
+        both = both.view(2, 2, 4, 2, 2, -1).permute(2, 0, 3, 1, 4, 5).reshape(64, -1)
+        scores = F.conv2d(features, both[:, :-1, None, None], both[:, -1])
         # Bounded scores need no maximum to be subtracted before the exponential.
-        weights = torch.exp(self.mask(features).clamp(-12, 12))
-        padded = F.pad(disparity, (1, 1, 1, 1), mode="replicate")
+        weights = torch.exp(scores.clamp(-12, 12)).view(batch, 4, 2, 2, 2, 2, height, width)
+        padded = F.pad(disparity, (1, 1, 1, 1), mode="replicate")[:, 0]
+        own = padded[:, None, 1:-1].expand(-1, 2, -1, -1)
+        other = torch.stack((padded[:, :-2], padded[:, 2:]), dim=1)  # row above, row below
 
-        def cell(dy: int, dx: int) -> Tensor:
-            return padded[:, :, 1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
+        def cells(rows: Tensor) -> tuple[Tensor, Tensor]:
+            """Of each quadrant, in its own column and in the one on its side: [B, 2, 2, h, w]."""
+            beside = torch.stack((rows[..., :-2], rows[..., 2:]), dim=2)
+            return rows[:, :, None, :, 1:-1].expand_as(beside), beside
 
-        quadrants = []
-        for quadrant, (dy, dx) in enumerate(itertools.product((-1, 1), repeat=2)):
-            part = weights[:, 16 * quadrant : 16 * quadrant + 16]
-            shares_of = [part[:, 4 * k : 4 * k + 4] for k in range(4)]
-            cells = (disparity, cell(0, dx), cell(dy, 0), cell(dy, dx))
-            terms = [share * near for share, near in zip(shares_of, cells, strict=True)]
-            quadrants.append(added(terms) / added(shares_of))
-        # First the quadrants of a cell fall into place, then the pixels of a quadrant.
-        blocks = torch.stack(quadrants, dim=2).view(batch, 16, height, width)
-        return F.pixel_shuffle(F.pixel_shuffle(blocks, 2), 2)[:, 0]
+        near = torch.stack((*cells(own), *cells(other)), dim=1)[:, :, :, None, :, None]
+        blocks = (weights * near).sum(dim=1) / weights.sum(dim=1)
+        return F.pixel_shuffle(blocks.reshape(batch, 16, height, width), 4)[:, 0]
 
 
 def added(terms: list[Tensor]) -> Tensor:

@@ -1,0 +1,49 @@
+"""Laws of the volumes of `lite`: only near pairs, read between their entries."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from vergence_models.layers import all_pairs, conv, joint
+from vergence_models.lite.volume import Volume, lookup, lookup_row, near_pairs, whole_rows
+
+
+@pytest.mark.parametrize("ratio", [1, 2])
+def test_near_pairs_are_those_of_all_pairs_within_reach(ratio: int) -> None:
+    reach, margin, width = 12, 3, 32
+    left, right = torch.randn(2, 4, 3, width), torch.randn(2, 4, 3, ratio * width)
+    near, everything = near_pairs(left, right, reach=reach, margin=margin), all_pairs(left, right)
+    assert near.scores.shape[3] < ratio * width
+    for x in range(width):
+        for entry in range(ratio * x - reach - margin, ratio * x + margin + 1):
+            if 0 <= entry < ratio * width:
+                got = near.scores[:, :, x, entry - int(near.first[x])]
+                assert torch.allclose(got, everything[:, :, x, entry], atol=1e-6)
+
+
+def squares(first: float = 0.0) -> Volume:
+    """Of a row of eight squares, all of it or what is left of it from ``first`` on."""
+    row = torch.arange(8.0)[int(first) :].view(1, 1, 1, -1) ** 2
+    return Volume(row, torch.tensor([first]), 7)
+
+
+@pytest.mark.parametrize("first", [0.0, 2.0])
+def test_lookups_interpolate_and_are_zero_outside(first: float) -> None:
+    at = torch.tensor([2.5, 6.25, -0.5, 7.5]).view(1, 4, 1, 1)
+    assert lookup(squares(first), at).flatten().tolist() == pytest.approx([6.5, 39.25, 0.0, 0.0])
+    row = lookup_row(squares(first), torch.full((1, 1, 1, 1), 3.5), 1)
+    assert row.flatten().tolist() == pytest.approx([6.5, 12.5, 20.5])
+
+
+def test_each_cell_reads_its_own_row() -> None:
+    scores = torch.randn(2, 3, 4, 9)
+    entry = torch.randint(0, 8, (2, 5, 3, 4))
+    expected = scores.gather(3, entry.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+    assert torch.equal(lookup(whole_rows(scores), entry.float()), expected)
+
+
+def test_a_joint_convolution_is_that_of_the_concatenation() -> None:
+    layer, parts = conv(9, 5, stride=2), [torch.randn(2, count, 8, 6) for count in (4, 3, 2)]
+    expected = layer(torch.cat(parts, dim=1))
+    assert torch.allclose(joint(layer, *parts), expected, atol=1e-5)
