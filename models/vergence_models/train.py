@@ -78,10 +78,11 @@ def train(trainer: Trainer, arguments: argparse.Namespace) -> None:
             write_line(out, {"step": trainer.progress.steps, "validation": trainer.measured})
             trainer.save(out)
             validated = saved = last = time.monotonic()
+    eaten.close()
+    trainer.save(out)  # before what takes long: whoever stops a run may not wait for it
     if held_out is not None and trainer.progress.steps:
         trainer.measured = validate(trainer.averaged_network(), held_out, trainer.device)
         write_line(out, {"step": trainer.progress.steps, "validation": trainer.measured})
-    eaten.close()
     trainer.save(out)
 
 

@@ -39,7 +39,9 @@ class Trainer:
         self.config = config
         self.device = device
         self.network = build_network(config.network).to(device)
-        if config.training.precision is Precision.BF16:  # the layout of the kernels for it
+        # The layout of the kernels for it. On one thread of a busy CPU with AMX a step of `full`, 8
+        # frames of 256x192, took 5 s so, 7 s in the other layout, and 15 s in float32.
+        if config.training.precision is Precision.BF16:
             self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
         self.optimizer = torch.optim.AdamW(

@@ -9,11 +9,13 @@ import onnx
 import pytest
 import torch
 
-from vergence_models.config import RaftNetworkConfig
-from vergence_models.export import PARITY_PX, check_parity, export_stitched, shifted_pair
+from vergence_models.config import Config, RaftNetworkConfig
+from vergence_models.export import PARITY_PX, check_parity, export_run, shifted_pair
 from vergence_models.graphs import folded
 from vergence_models.raft.network import RaftNetwork, RaftState
 from vergence_models.raft.update import looked_up, pyramid
+from vergence_models.runs import Run
+from vergence_proto.model_io import ManifestError, load_model_card
 
 HEIGHT, WIDTH = 96, 224
 TINY = {
@@ -55,20 +57,27 @@ def quiet(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("quiet")
-@pytest.mark.parametrize("warp", [True, False], ids=["full", "fast"])
-def test_stitched_graphs_equal_pytorch_frame_by_frame(warp: bool, tmp_path: Path) -> None:
-    network = tiny_network(warp=warp)
-    paths = {count: tmp_path / f"tiny_{count}.onnx" for count in (1, 3)}
-    weights = tmp_path / "tiny.weights"
-    export_stitched(network, paths, weights)
-    for count, path in paths.items():
+@pytest.mark.parametrize("tier", ["full", "fast"])
+def test_exported_graphs_equal_pytorch_and_share_their_weights(tier: str, tmp_path: Path) -> None:
+    network = tiny_network(warp=tier == "full")
+    run = Run(tier, network.config, network.state_dict(), story={}, measured={})
+    export_run(run, Config(tier, network.config, iterations=(1, 3)), tmp_path)
+
+    card = load_model_card(tmp_path, tier)
+    assert card.state == network.state_tensors
+    weights = tmp_path / f"{tier}.weights"
+    for count, path in card.graphs.items():
         assert check_parity(network, count, path, frames=4) < PARITY_PX
         kinds = {node.op_type for node in onnx.load(path, load_external_data=False).graph.node}
         assert not kinds & {"BatchNormalization", "Loop", "If"}
-        # More iterations are more of the same nodes, not more weights.
-        assert path.stat().st_size < weights.stat().st_size
     stored = sum(p.numel() * 4 for p in folded(network).parameters())
-    assert weights.stat().st_size < 2 * stored
+    assert stored / 2 < weights.stat().st_size < stored * 2  # once, not once a count
+
+    content = bytearray(weights.read_bytes())
+    content[len(content) // 2] ^= 1
+    weights.write_bytes(content)
+    with pytest.raises(ManifestError, match=rf"{tier}.weights: expected sha256"):
+        load_model_card(tmp_path, tier)
 
 
 def test_folding_batch_norms_changes_no_result() -> None:
