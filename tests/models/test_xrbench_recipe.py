@@ -209,8 +209,11 @@ def test_a_stopped_run_goes_on_and_keeps_what_is_there(tmp_path: Path) -> None:
 
     image = lost.read_bytes()
     lost.unlink()
-    render_sequence(longer, tmp_path, passes=("clean",), variant="scalar_rgb")
+    render_sequence(TINY, tmp_path, passes=("clean",), variant="scalar_rgb")
     assert lost.read_bytes() == image  # the same recipe, the same picture
+    # Fewer frames were asked for than are there: those that are there keep their poses.
+    source = open_source(f"sceneflow:{tmp_path}/frames_cleanpass/{TINY.name}")
+    assert [each.frame.pose is not None for each in source] == [True, True]
 
 
 def test_another_recipe_may_not_mix_with_a_sequence_that_is_there(tmp_path: Path) -> None:

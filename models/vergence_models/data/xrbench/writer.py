@@ -25,6 +25,7 @@ import json
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 
 import cv2
@@ -50,13 +51,13 @@ def render_sequence(
     Raises BadRecipe: the folder holds a sequence of the same name by another recipe. NoRenderer:
     as `StereoCamera`.
     """
-    _claim(recipe, folder)
+    frames = _claim(recipe, folder)
     todo = [k for k in range(recipe.frames) if not _whole(recipe, folder, k, passes)]
     for _ in range(recipe.frames - len(todo)):
         on_frame()
     camera = StereoCamera(recipe, variant=variant) if todo else None
     if camera:
-        _write_calibration(camera, folder)
+        _write_calibration(camera, folder, frames)
         for frame in todo:
             for path, data in _files(camera, frame, passes).items():
                 _write(folder / path, data)
@@ -64,7 +65,8 @@ def render_sequence(
     return folder / f"frames_{passes[-1]}pass" / recipe.name
 
 
-def _claim(recipe: Recipe, folder: Path) -> None:
+def _claim(recipe: Recipe, folder: Path) -> int:
+    """State the recipe in the folder, and give how many frames the sequence has there."""
     path = folder / "recipes" / f"{recipe.name}.json"
     if path.exists():
         there = Recipe.from_json(path.read_text("utf-8"), path)
@@ -72,8 +74,9 @@ def _claim(recipe: Recipe, folder: Path) -> None:
         if replace(there, frames=recipe.frames) != recipe:
             raise BadRecipe(f"{path} is another recipe; render into another folder or remove it")
         if there.frames >= recipe.frames:
-            return
+            return there.frames
     _write(path, recipe.to_json().encode())
+    return recipe.frames
 
 
 def _whole(recipe: Recipe, folder: Path, frame: int, passes: tuple[str, ...]) -> bool:
@@ -116,10 +119,10 @@ def _truth_files(truth: FrameTruth, name: str, frame: int) -> Mapping[Path, byte
     }  # fmt: skip
 
 
-def _write_calibration(camera: StereoCamera, folder: Path) -> None:
+def _write_calibration(camera: StereoCamera, folder: Path, frames: int) -> None:
     recipe = camera.recipe
     blocks = []
-    for frame in range(recipe.frames):
+    for frame in range(frames):
         time_s = camera.path.frame_time_s(frame)
         left, right = (_words(camera.world_from_eye(time_s, eye)) for eye in Eye)
         blocks += [f"Frame {frame}", f"L {left}", f"R {right}", ""]
@@ -132,9 +135,9 @@ def _write_calibration(camera: StereoCamera, folder: Path) -> None:
     data = folder / "camera_data" / recipe.name
     _write(data / "camera_data.txt", "\n".join(blocks).encode())
     _write(data / "intrinsics.json", (json.dumps(intrinsics, indent=1) + "\n").encode())
-    rays = folder / "rays" / recipe.name / "left.npy"
-    rays.parent.mkdir(parents=True, exist_ok=True)
+    rays = BytesIO()
     np.save(rays, truths.rays(camera.optics))
+    _write(folder / "rays" / recipe.name / "left.npy", rays.getvalue())
 
 
 def _words(world_from_camera: Matrix) -> str:
