@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import onnx
@@ -45,7 +46,7 @@ def wall_model(*, outlier: float = 0.0) -> ModelProto:
     answer[0, 15, 1, 1] = 1.0
     start = np.zeros(16, np.float32)
     start[15] = outlier
-    constants = {
+    constants: dict[str, NDArray[Any]] = {
         "patch.weight": weight(8, 3, 4, 4) / 128,
         "first.weight": weight(16, 8, 3, 3),
         "second.weight": weight(16, 16, 3, 3) * (np.arange(16) < 15)[:, None, None, None],
@@ -59,7 +60,7 @@ def wall_model(*, outlier: float = 0.0) -> ModelProto:
     }
     three = {"pads": [1, 1, 1, 1]}
 
-    def node(op: str, inputs: str, output: str, **attributes: object) -> NodeProto:
+    def node(op: str, inputs: str, output: str, **attributes: Any) -> NodeProto:
         return helper.make_node(op, inputs.split(), [output], **attributes)
 
     nodes = [
@@ -78,7 +79,7 @@ def wall_model(*, outlier: float = 0.0) -> ModelProto:
         helper.make_node("Resize", ["next_disparity", "", "four"], ["large"], mode="nearest"),
         node("Squeeze", "large channel", "disparity"),
     ]
-    image = ["B", "H", "W", 3]
+    image: list[str | int | None] = ["B", "H", "W", 3]
     inputs = [
         helper.make_tensor_value_info("left", TensorProto.UINT8, image),
         helper.make_tensor_value_info("right", TensorProto.UINT8, image),
@@ -155,7 +156,7 @@ def test_graphs_are_replaced_and_the_loss_is_told(tmp_path: Path, pool: ClipPool
     paths = {count: tmp_path / f"wall_{count}.onnx" for count in (1, 2)}
     for path in paths.values():
         onnx.save(wall_model(), path)
-    story = make_int8(paths, STATES, pool, max_disparity_px=192)
+    story = cast("dict[str, Any]", make_int8(paths, STATES, pool, max_disparity_px=192))
     assert story["convolutions"] == 3
     assert story["measured_clips"] == 2
     assert 0 < story["float_epe_px"] < 1
