@@ -100,7 +100,8 @@ def test_splatting_by_softmax_reproduces_the_next_view_too(name: str) -> None:
 
     back = torch.linalg.inv(matrix.double()).float()
     for scale, (values, known) in zip((8, 16), hidden, strict=True):
-        u, v = cell_centres(*values.shape[2:], scale, values)
+        height, width = values.shape[2:]
+        u, v = cell_centres(height, width, scale, values)
         u_from, _, _ = transform_uvd(back, u, v, wall_disparity(world_from_curr, scale))
         expected = (u_from + 0.5) / scale - 0.5
         inside = (known[:, 0] > 0) & (expected > 1) & (expected < values.shape[3] - 2)
