@@ -41,6 +41,7 @@ class LiteNetworkConfig(NetworkConfig):
     cost_channels: int = 16  # of the filter that all coarse disparities share
     hidden: int = 32  # recurrent state at 1/8
     fine_channels: int = 32
+    fine_low: int = 48  # the refinement's view at 1/8
 
 
 @dataclass(frozen=True, slots=True)

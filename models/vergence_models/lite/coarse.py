@@ -13,18 +13,17 @@ from vergence_models.layers import (
     box3,
     conv,
     enlarge,
-    lookup,
-    lookup_row,
     shares,
     silent,
     squash,
 )
+from vergence_models.lite.volume import Volume, gathered, lookup, lookup_row
 from vergence_models.warp import cell_centres
 
 BIN_PX = 4  # spacing of the coarse disparities
 REACH = 2  # entries looked up on either side of the current disparity
 TAPS = 2 * REACH + 1
-CELL_INPUTS = TAPS + 8  # what the cell sees besides the context
+CELL_INPUTS = TAPS + 9  # what the cell sees besides the context
 MIN_PX = 0.1  # no answer is nearer to infinity
 
 
@@ -82,31 +81,31 @@ class CostFilter(nn.Module):
         stacked = torch.stack(channels, dim=2)
         x = self.enter(stacked.reshape(batch * bins, len(channels), height, width))
         x = x.view(batch, bins, -1, height // 2, width // 2) + self.context(context)[:, None]
-        x = F.relu(x.view(batch * bins, -1, height // 2, width // 2))
-        low = F.relu(self.low(F.relu(self.down(x))))
-        x = F.relu(self.middle(x + enlarge(low)))
+        x = F.relu6(x).view(batch * bins, -1, height // 2, width // 2)
+        low = F.relu6(self.low(F.relu6(self.down(x))))
+        x = F.relu6(self.middle(x + enlarge(low)))
         residual = F.pixel_shuffle(self.leave(x), 2).view(batch, bins, height, width)
         return (fixed + 10 * self.mutual * claim + residual).permute(0, 2, 3, 1)
 
 
-def coarse_position(d: Tensor, bins: int) -> Tensor:
-    """Where disparity ``d`` px lies on the last axis of the coarse scores."""
-    return (bins - 1) - d * (1 / BIN_PX)
+def coarse_position(d: Tensor, last: int) -> Tensor:
+    """Where disparity ``d`` px lies among the coarse scores, the last of which is that of 0 px."""
+    return last - d * (1 / BIN_PX)
 
 
-def peak(scores: Tensor) -> tuple[Tensor, Tensor]:
+def peak(volume: Volume) -> tuple[Tensor, Tensor]:
     """Disparity px and log-probability of the best window of five bins, each [B, 1, H, W]."""
+    scores = volume.scores
     bins = scores.shape[-1]
-    best = scores.argmax(dim=-1, keepdim=True).clamp(2, bins - 3)
-    offsets = torch.arange(-2, 3, device=scores.device)
-    window = scores.gather(3, best + offsets)
-    top = window.amax(dim=-1, keepdim=True)
+    best = scores.argmax(dim=-1)[:, None].clamp(2, bins - 3).to(scores.dtype)
+    offsets = torch.arange(-2, 3, device=scores.device).to(scores.dtype)[:, None, None]
+    window = gathered(volume, best + offsets)
+    top = window.amax(dim=1, keepdim=True)
     weights = torch.exp(window - top)
-    mass = weights.sum(dim=-1, keepdim=True)
-    total = torch.exp(scores - top).sum(dim=-1, keepdim=True)
-    centre = (weights * offsets.to(scores.dtype)).sum(dim=-1, keepdim=True) / mass
-    d = (bins - 1 - best.to(scores.dtype) - centre) * BIN_PX
-    return d.permute(0, 3, 1, 2), torch.log(mass / total).permute(0, 3, 1, 2)
+    mass = weights.sum(dim=1, keepdim=True)
+    total = torch.exp(scores - top[:, 0, :, :, None]).sum(dim=-1)[:, None]
+    centre = (weights * offsets).sum(dim=1, keepdim=True) / mass
+    return (bins - 1 - best - centre) * BIN_PX, torch.log(mass / total)
 
 
 def smooth_fill(d: Tensor, confidence: Tensor) -> Tensor:
@@ -137,6 +136,15 @@ def far_fill(d: Tensor, confidence: Tensor, otherwise: Tensor) -> Tensor:
     return torch.where(found < 1e3, found, otherwise)
 
 
+def beyond(d: Tensor, *, scale: int) -> Tensor:
+    """How many cells the match lies beyond the left border of the right image, -1 to 1.
+
+    ``d`` [B, K, H, W] px at 1/``scale``. Nothing can match there: what looks like it is noise.
+    """
+    u, _ = cell_centres(d.shape[2], d.shape[3], scale, d)
+    return ((d - u) * (1 / scale)).clamp(-1, 1)
+
+
 class CoarseUpdate(nn.Module):
     """One iteration at 1/8: look at the scores round the current disparity, choose, correct."""
 
@@ -155,18 +163,16 @@ class CoarseUpdate(nn.Module):
         fill: Tensor,
         far: Tensor,
         hole: Tensor,
-        scores: Tensor,
+        scores: Volume,
         top: Tensor,
         context: Tensor,
     ) -> tuple[Tensor, Tensor]:
         """Hidden state and disparity [B, 1, H, W] px to the next ones."""
         guess_px, guess_log = guess
-        bins = scores.shape[-1]
-        around = lookup_row(scores, coarse_position(d, bins).permute(0, 2, 3, 1), REACH)
         fills = torch.cat((fill, far), dim=1)
-        at_fills = lookup(scores, coarse_position(fills, bins).permute(0, 2, 3, 1))
-        log_p = torch.cat((around, at_fills), dim=-1).permute(0, 3, 1, 2)
-        log_p = (log_p - top).clamp(-20, 0)
+        around = lookup_row(scores, coarse_position(d, scores.last), REACH)
+        at_fills = lookup(scores, coarse_position(fills, scores.last))
+        log_p = (torch.cat((around, at_fills), dim=1) - top).clamp(-20, 0)
         inputs = torch.cat(
             (
                 context,
@@ -177,6 +183,7 @@ class CoarseUpdate(nn.Module):
                 squash(far - d, 2.0),
                 hole,
                 d * (1 / 64),
+                beyond(d, scale=8),
             ),
             dim=1,
         )

@@ -26,8 +26,10 @@ from vergence_models.lite.coarse import (
     smooth_fill,
 )
 from vergence_models.lite.context import Context
-from vergence_models.lite.losses import coarse_cross_entropy
-from vergence_models.lite.refinement import Refinement
+from vergence_models.lite.losses import search_cross_entropy
+from vergence_models.lite.refinement import REACH, Refinement
+from vergence_models.lite.sharp import FINE_PX, sharp_search
+from vergence_models.lite.volume import near_pairs, whole_rows
 from vergence_models.losses import known, masked_mean, output_loss, robust
 from vergence_models.network import Estimate, State, StereoNetwork
 from vergence_models.warp import warp_state
@@ -46,6 +48,7 @@ class LiteEstimate(Estimate):
     """The answer, and the guesses on the way to it."""
 
     coarse_scores: Tensor  # [B, H/8, W/8, D]: unnormalised log-probability, largest disparity first
+    sharp_scores: Tensor  # [B, H/8, W/8, D']: correlation of fine descriptors, as above
     eighths: list[Tensor]  # [B, 1, H/8, W/8] px: the first guess, then after each iteration
     quarter: Tensor  # [B, 1, H/4, W/4] px
 
@@ -61,7 +64,13 @@ class LiteEstimate(Estimate):
             loss = loss + 0.3 / (len(self.eighths) - 1) * masked_mean(
                 robust((inner - eighth).abs()), mask
             )
-        return loss + 0.2 * coarse_cross_entropy(self.coarse_scores, truth_px, max_disparity_px)
+        loss = loss + 0.2 * search_cross_entropy(
+            self.coarse_scores, truth_px, max_disparity_px, bin_px=BIN_PX
+        )
+        # A correlation is at most 1: sharpened, it can rule out.
+        return loss + 0.05 * search_cross_entropy(
+            15 * self.sharp_scores, truth_px, max_disparity_px, bin_px=FINE_PX
+        )
 
 
 class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
@@ -91,7 +100,15 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         previous = LiteState(*state)
         left_rows, right_rows = interleave(left), interleave(right)
         left_half, right_half = half_gray(left_rows), half_gray(right_rows)
-        fine = all_pairs(self.fine_descriptor(left_half, 2), self.fine_descriptor(right_half, 1))
+        left_fine = self.fine_descriptor(left_half, 2)
+        right_fine = self.fine_descriptor(right_half, 1)
+        fine = near_pairs(
+            left_fine,
+            right_fine,
+            reach=self.config.max_disparity_px // FINE_PX,
+            margin=REACH + 2,
+        )
+        sharp = sharp_search(left_fine, right_fine, self.config.max_disparity_px // FINE_PX)
         coarse = banded(
             all_pairs(
                 self.coarse_descriptor(F.avg_pool2d(left_half, 2), 2),
@@ -108,8 +125,8 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         hole8 = (seen8 <= 0).to(prior.dtype)
         prior8 = F.avg_pool2d(prior, 2) / seen8.clamp(min=0.1)
 
-        scores = self.cost_filter(coarse, context16, prior8)
-        top = scores.amax(dim=-1)[:, None]
+        scores = whole_rows(self.cost_filter(coarse, context16, prior8))
+        top = scores.scores.amax(dim=-1)[:, None]
         guess = peak(scores)
         confidence = torch.exp(4 * guess[1])
         fill = smooth_fill(guess[0], confidence)
@@ -129,8 +146,8 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
                 context=context8,
             )
             eighths.append(d)
-        disparity, sigma, quarter = self.refinement(fine, d, hidden, prior, context4)
-        estimate = LiteEstimate(disparity, sigma, scores, eighths, quarter)
+        disparity, sigma, quarter = self.refinement(fine, d, sharp, hidden, prior, context4)
+        estimate = LiteEstimate(disparity, sigma, scores.scores, sharp.scores, eighths, quarter)
         return estimate, LiteState(quarter, hidden)
 
 

@@ -13,16 +13,17 @@ from vergence_models.layers import (
     box3,
     conv,
     enlarge,
-    lookup,
-    lookup_row,
+    joint,
     shares,
     silent,
     squash,
 )
-from vergence_models.lite.coarse import MIN_PX
+from vergence_models.lite.coarse import MIN_PX, beyond
+from vergence_models.lite.sharp import FINE_PX, SharpSearch, rims
+from vergence_models.lite.volume import Volume, lookup, lookup_row
 from vergence_models.warp import cell_centres
 
-FINE_PX = 2  # spacing of the fine descriptors along the right row
+SURFACES = 7  # hypotheses of a cell
 REACH = 2  # entries looked up on either side of the current disparity
 TAPS = 2 * REACH + 1
 
@@ -34,8 +35,12 @@ class Refinement(nn.Module):
         super().__init__()
         width = config.fine_channels
         self.hidden = conv(config.hidden, 16, kernel=1)
-        self.first = conv(config.context_quarter + 16 + 12, width, kernel=1)
-        self.choose = silent(conv(width, 4))
+        self.first = conv(config.context_quarter + 16 + 4 * SURFACES + 1, width, kernel=1)
+        self.down = conv(width, config.fine_low, stride=2)
+        self.low = conv(config.fine_low, config.fine_low)
+        self.lower = conv(config.fine_low, config.fine_low)
+        self.back = silent(conv(config.fine_low, width, kernel=1))
+        self.choose = silent(conv(width, SURFACES))
         self.second = conv(width + 2 * TAPS + 6, width)
         self.out = silent(conv(width, 3, kernel=1))
         self.upsample = ConvexUpsampler(width)
@@ -43,25 +48,35 @@ class Refinement(nn.Module):
         self.subpixel = nn.Parameter(torch.tensor(12.0))
 
     def forward(
-        self, pairs: Tensor, d_eighth: Tensor, hidden: Tensor, prior: Tensor, context: Tensor
+        self,
+        pairs: Volume,
+        d_eighth: Tensor,
+        sharp: SharpSearch,
+        hidden: Tensor,
+        prior: Tensor,
+        context: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Full-size disparity and sigma [B, H, W], and the disparity at 1/4 [B, 1, H/4, W/4]."""
         u, _ = cell_centres(prior.shape[2], prior.shape[3], 4, prior)
         column = (u - 1.5) * (1 / FINE_PX)
 
         def position(d: Tensor) -> Tensor:
-            return (column - d * (1 / FINE_PX)).permute(0, 2, 3, 1)
+            return column - d * (1 / FINE_PX)
 
         plain = F.interpolate(d_eighth, scale_factor=2.0, mode="bilinear")
-        rims = torch.cat((F.max_pool2d(d_eighth, 3, 1, 1), -F.max_pool2d(-d_eighth, 3, 1, 1)), 1)
         hole = (prior <= 0).to(prior.dtype)
         carried = prior + hole * plain
-        surfaces = torch.cat((plain, enlarge(rims), carried), dim=1)
-        cost = lookup(pairs, position(surfaces)).permute(0, 3, 1, 2)
+        around = enlarge(torch.cat((rims(d_eighth), sharp.disparity, rims(sharp.disparity)), dim=1))
+        surfaces = torch.cat((plain, around[:, :2], carried, around[:, 2:]), dim=1)
+        cost = lookup(pairs, position(surfaces))
         wide = box3(cost)
         apart = squash(surfaces[:, 1:] - plain, 2.0)
         up = enlarge(self.hidden(hidden))
-        x = F.relu(self.first(torch.cat((context, up, cost, wide, apart, hole), dim=1)))
+        told = (enlarge(sharp.correlation), cost, wide, apart, hole, beyond(surfaces, scale=4))
+        x = F.relu(joint(self.first, context, up, torch.cat(told, dim=1)))
+        # Where an object ends shows in a wider view than 3x3 cells.
+        low = F.relu6(self.lower(F.relu6(self.low(F.relu6(self.down(x))))))
+        x = F.relu(x + enlarge(self.back(low)))
         fixed = cost * self.sharpness[0] + wide * self.sharpness[1]
         choice = shares(fixed + 4 * self.choose(x), dim=1)
         d = (choice * surfaces).sum(dim=1, keepdim=True)
@@ -69,16 +84,16 @@ class Refinement(nn.Module):
         # Sub-pixel: the centre of the peak that the window's mean makes along the surface. A
         # larger position is a smaller disparity.
         looked_at = position(d)
-        taps = lookup_row(pairs, looked_at, REACH).permute(0, 3, 1, 2)
+        taps = lookup_row(pairs, looked_at, REACH)
         smooth = box3(taps)
         fit = shares(self.subpixel * smooth, dim=1)
         offset = added([fit[:, k : k + 1] * (FINE_PX * (REACH - k)) for k in range(TAPS)])
         d = d + offset
         step = carried - d
         # Interpolated entries flatten a peak between two of them: tell where between them it lies.
-        phase = (looked_at - torch.floor(looked_at)).permute(0, 3, 1, 2).detach()
-        small = (squash(step, 0.5), squash(offset, 0.5), apart[:, :2], phase, hole)
-        x = F.relu(self.second(torch.cat((x, taps, smooth, *small), dim=1)))
+        phase = (looked_at - torch.floor(looked_at)).detach()
+        told = (taps, smooth, squash(step, 0.5), squash(offset, 0.5), apart[:, :2], phase, hole)
+        x = F.relu(joint(self.second, x, torch.cat(told, dim=1)))
         out = self.out(x)
         # The previous frame's surface is evidence too, while it agrees: half of a small step.
         keep = torch.sigmoid(4 * out[:, 1:2]) * torch.exp(-step.abs()) * (1 - hole)
