@@ -96,8 +96,6 @@ def test_a_faster_playback_is_the_same_path_to_the_same_last_view() -> None:
 
 
 def test_what_has_no_past_is_the_same_at_every_speed(tables: dict[str, Table]) -> None:
-    (sgbm,) = (row for row in tables["speed"].rows if row.label == "SGBM, full size")
-    assert len(set(sgbm.values.values())) == 1
     cold = [row for row in tables["warp"].rows if "no state" in row.label]
     assert cold
     assert all(row.values["loss"] == 0 for row in cold)
