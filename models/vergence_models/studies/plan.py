@@ -134,7 +134,8 @@ def movement_speed(bench: Bench) -> Table:
         name="speed",
         title="Movement speed, 1x to 20x",
         text=f"EPE in px on {bench.clips_at(1).words}. A calm head's path (about 10 degrees and 10 "
-        "cm a second) is played back faster. What has no past is the same at every speed, and left out.",
+        "cm a second) is played back faster. What has no past is the same at every speed, and left "
+        "out.",
         columns={f"{speed}x": f"{speed}x" for speed in SPEEDS},
         rows=[Row(label, values) for label, values in cells.items()],
         training=training_of(bench.contenders),
