@@ -94,6 +94,19 @@ class TestRooms:
         nearest_m = min(float(np.linalg.norm(points - eye, axis=1).min()) for eye in eyes[::10])
         assert nearest_m > 0.25
 
+    def test_no_picture_hangs_in_another_one(self, kind: str) -> None:
+        """Two surfaces in one place have no truth that could tell them apart."""
+        for seed in range(1, 6):
+            corners = []
+            for thing in rooms.build(kind, seed).things:
+                if thing.name in ("picture", "mirror"):
+                    (_, mesh), *_ = thing.parts
+                    points = mesh.moved(thing.pose(0)).points
+                    corners.append((points.min(0), points.max(0)))
+            for k, (low, high) in enumerate(corners):
+                for other_low, other_high in corners[:k]:
+                    assert ((low > other_high) | (high < other_low)).any()
+
     def test_normals_are_unit_and_agree_with_how_faces_are_wound(self, kind: str) -> None:
         for thing in rooms.build(kind, 1).things:
             for _, mesh in thing.parts:

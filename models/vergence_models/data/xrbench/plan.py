@@ -40,6 +40,7 @@ class Plan:
         self._rng, self._palette = rng, palette
         eye_x = rng.uniform(-0.35, 0.35) * half_x
         self.eye_m = np.array([eye_x, -rng.uniform(1.25, 1.6), -half_z + rng.uniform(0.55, 0.8)])
+        self._hung: list[tuple[Wall, float, float, float, float]] = []  # x, y, half its size
         self._taken: list[NDArray[np.float64]] = []  # x0, z0, x1, z1
 
     def add(self, name: str, bench: Workbench, frame: meshes.Matrix | None = None) -> None:
@@ -119,7 +120,7 @@ class Plan:
         return None
 
     def hang(self, side: Wall, surface: Surface, half_x: float, half_y: float, y_m: float) -> None:
-        """A picture or a mirror in a frame on a wall."""
+        """A picture or a mirror in a frame on a wall; left out where another one hangs."""
         width, away = self._extent(side)
         bench, wood = Workbench(), self._palette.wood()
         bench.add(surface, meshes.sheet(half_x, half_y), (0, 0, -0.021))
@@ -128,6 +129,11 @@ class Plan:
             bench.box(wood, (sign * half_x, 0, -0.02), (0.015, half_y + 0.015, 0.02))
             bench.box(wood, (0, sign * half_y, -0.02), (half_x, 0.015, 0.02))
         x = self._rng.uniform(-0.8, 0.8) * (width - half_x)
+        for other, other_x, other_y, reach_x, reach_y in self._hung:
+            beside = abs(x - other_x) > half_x + reach_x + 0.05
+            if other is side and not beside and abs(y_m - other_y) < half_y + reach_y + 0.05:
+                return
+        self._hung.append((side, x, y_m, half_x, half_y))
         turn = placed(0, 0, 0, yaw=side.value)
         self.add("mirror" if surface.finish.value == "mirror" else "picture", bench,
                  turn @ placed(x, -y_m, away))  # fmt: skip
