@@ -18,7 +18,7 @@ from onnx import ModelProto, TensorProto, helper
 from vergence_models.data.clips import StereoClips
 from vergence_models.data.pool import ClipPool
 from vergence_models.motion import uvd_transforms
-from vergence_models.quantize import Scale, copy_of, plan, quantized
+from vergence_models.quantize import Scale, copy_of, plan, quantized, with_weights_apart
 from vergence_models.validation import filmed
 from vergence_proto.model_io import DISPARITY, LEFT, RIGHT, UVD_CURR_FROM_PREV, StateTensor
 
@@ -49,7 +49,7 @@ def make_int8(
     clips = filmed(pool, range(RANGE_CLIPS))
     story: dict[str, object] = {}
     for count, path in sorted(paths.items()):
-        model = onnx.load(path)
+        model = with_weights_apart(onnx.load(path))
         what = plan(model)
         int8 = quantized(model, what, find_scales(model, what.measured, states, clips))
         if not story:

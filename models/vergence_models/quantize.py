@@ -54,6 +54,24 @@ class Plan:
         return sorted(set(self.source.values()))
 
 
+def with_weights_apart(model: ModelProto) -> ModelProto:
+    """The same graph; weights that it would split while it runs are constants of their own."""
+    model = copy_of(model)
+    constants = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
+    for node in [node for node in model.graph.node if node.op_type == "Split"]:
+        if len(node.input) < 2 or any(name not in constants for name in node.input):
+            continue
+        whole, sizes = (constants[name] for name in node.input)
+        axis = next((entry.i for entry in node.attribute if entry.name == "axis"), 0)
+        parts = np.split(whole, np.cumsum(sizes)[:-1], axis=axis)
+        model.graph.initializer.extend(
+            numpy_helper.from_array(np.ascontiguousarray(part), name)
+            for part, name in zip(parts, node.output, strict=True)
+        )
+        model.graph.node.remove(node)
+    return model
+
+
 def plan(model: ModelProto) -> Plan:
     """What to quantise: convolutions of features, what goes in and out of them, and its sums."""
     constants = {tensor.name: tensor for tensor in model.graph.initializer}

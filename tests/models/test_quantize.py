@@ -23,7 +23,7 @@ from vergence_models.calibrate import (
     make_int8,
 )
 from vergence_models.data.pool import ClipPool, write_shard
-from vergence_models.quantize import Scale, plan, quantized
+from vergence_models.quantize import Scale, plan, quantized, with_weights_apart
 from vergence_proto.model_io import StateTensor
 
 STATES = (StateTensor("disparity", 1, 4),)
@@ -141,6 +141,21 @@ def test_convolutions_of_features_become_bytes_and_images_stay() -> None:
     assert weights["patch.weight"] == TensorProto.FLOAT
     # Relus of bytes are the range of the bytes; the image's is one more before the bytes begin.
     assert Counter(node.op_type for node in graph.node)["Relu"] == 1
+
+
+def test_split_weights_become_constants_of_their_own() -> None:
+    model = wall_model()
+    (place,) = (k for k, node in enumerate(model.graph.node) if node.output[0] == "a")
+    split = helper.make_node("Split", ["first.weight", "sizes"], ["head", "rest"], axis=0)
+    joined = helper.make_node("Concat", ["head", "rest"], ["first"], axis=0)
+    model.graph.node[place].input[1] = "first"
+    for node in (joined, split):
+        model.graph.node.insert(place, node)
+    sizes = numpy_helper.from_array(np.array([5, 11], np.int64), "sizes")
+    model.graph.initializer.append(sizes)
+    apart = with_weights_apart(model)
+    assert "Split" not in {node.op_type for node in apart.graph.node}
+    np.testing.assert_array_equal(answer_of(apart), answer_of(model))
 
 
 @pytest.mark.parametrize(("low", "high"), [(-1.0, 1.0), (0.0, 6.0), (2.0, 5.0), (-3.0, -1.0)])
