@@ -27,6 +27,9 @@ Array = NDArray[np.generic]
 RANGE_CLIPS = 4
 MEASURED_CLIPS = 16  # those that follow
 BATCH = 4
+# A byte's step in the features moves 99 of 100 pixels by less than this. Where two hypotheses are
+# equally good it may tip the choice, as the order of sums does in float32.
+PARITY_PX = 0.25
 MAX_LOSS = 1.03  # EPE of the int8 graph over that of the float one
 
 
