@@ -178,6 +178,8 @@ def main(arguments: list[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     if not (given.data or given.pool):
         parser.error("nothing to evaluate on: name --data KIND:PATH or --pool DIR")
+    if given.json:
+        given.json.parent.mkdir(parents=True, exist_ok=True)
     try:
         network = OnnxNetwork(given.weights, given.model, threads=given.threads)
         results = evaluate(
