@@ -92,22 +92,6 @@ def best_rival(scores: Tensor, columns: int) -> Tensor:
     return found.view(batch, height, width, disparities)
 
 
-def lookup(volume: Tensor, position: Tensor) -> Tensor:
-    """Linear interpolation along the last axis: [B, H, W, N] at [B, H, W, K]; 0 outside.
-
-    No gradient flows to the position: a disparity learns from its own loss, not from wishing to
-    have been looked up elsewhere, which would blow up over iterations and frames.
-    """
-    position = position.detach()
-    last = volume.shape[-1] - 1
-    low = torch.floor(position)
-    inside = ((low >= 0) & (low < last)).to(volume.dtype)
-    index = low.clamp(0, last - 1).long()
-    below = volume.gather(3, index)
-    above = volume.gather(3, index + 1)
-    return (below + (above - below) * (position - low)) * inside
-
-
 def lookup_row(volume: Tensor, position: Tensor, reach: int) -> Tensor:
     """Interpolate at each ``position`` [B, H, W, 1] and ``reach`` steps to either side of it.
 
@@ -159,7 +143,7 @@ def joint(layer: nn.Conv2d, *parts: Tensor) -> Tensor:
 
     Quantised, each part has a scale of its own, and one that comes from a convolution stays bytes.
     """
-    weights = layer.weight.split([part.shape[1] for part in parts], dim=1)
+    weights = torch.split(layer.weight, [part.shape[1] for part in parts], dim=1)
     biases = (layer.bias, *(None for _ in parts[1:]))
     return added(
         [

@@ -14,7 +14,7 @@ from vergence_models.config import LiteNetworkConfig
 from vergence_models.evaluate import WEIGHTS
 from vergence_models.export import PARITY_PX, check_parity, shifted_pair
 from vergence_models.graphs import export_part, whole_step
-from vergence_models.layers import all_pairs, banded, best_rival, lookup, lookup_row
+from vergence_models.layers import all_pairs, banded, best_rival, lookup_row
 from vergence_models.lite.network import LiteNetwork, LiteState
 from vergence_models.stepping import OnnxNetwork
 
@@ -148,7 +148,5 @@ def test_all_pairs_is_the_mean_product_of_descriptors() -> None:
 
 def test_lookups_interpolate_and_are_zero_outside() -> None:
     volume = torch.arange(8.0).view(1, 1, 1, 8) ** 2
-    at = torch.tensor([2.5, 6.25, -0.5, 7.5]).view(1, 1, 1, 4)
-    assert lookup(volume, at).flatten().tolist() == pytest.approx([6.5, 39.25, 0.0, 0.0])
     row = lookup_row(volume, torch.full((1, 1, 1, 1), 3.5), 1)
     assert row.flatten().tolist() == pytest.approx([6.5, 12.5, 20.5])

@@ -92,8 +92,8 @@ class Refinement(nn.Module):
         step = carried - d
         # Interpolated entries flatten a peak between two of them: tell where between them it lies.
         phase = (looked_at - torch.floor(looked_at)).detach()
-        told = (taps, smooth, squash(step, 0.5), squash(offset, 0.5), apart[:, :2], phase, hole)
-        x = F.relu(joint(self.second, x, torch.cat(told, dim=1)))
+        fitted = (taps, smooth, squash(step, 0.5), squash(offset, 0.5), apart[:, :2], phase, hole)
+        x = F.relu(joint(self.second, x, torch.cat(fitted, dim=1)))
         out = self.out(x)
         # The previous frame's surface is evidence too, while it agrees: half of a small step.
         keep = torch.sigmoid(4 * out[:, 1:2]) * torch.exp(-step.abs()) * (1 - hole)
