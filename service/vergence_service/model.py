@@ -186,6 +186,13 @@ class OnnxStereoModel:
             self._session(count)
 
     def step(self, steps: Sequence[Step]) -> list[StepResult]:
+        # Row by row where a batch gains nothing: a CPU's kernels sum in an order that depends on
+        # the batch, and a stream's answer must not depend on its neighbours.
+        if self._device is None:
+            return [result for step in steps for result in self._step([step])]
+        return self._step(steps)
+
+    def _step(self, steps: Sequence[Step]) -> list[StepResult]:
         height, width = steps[0].view.left.shape[:2]
         session, feeds = self._session(steps[0].iterations), self._feeds(steps)
         tensors: Sequence[Tensor]

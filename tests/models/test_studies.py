@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from tests.models.clips import wall_clips
+from vergence_models.calibrate import PARITY_PX
 from vergence_models.data.generator import ClipGenerator, GeneratorConfig
 from vergence_models.data.shots import Playback
 from vergence_models.evaluate import WEIGHTS
@@ -187,7 +188,7 @@ def test_a_run_adds_only_the_counts_that_no_graph_has(network: OnnxNetwork, wall
     for found, expected in zip(by_torch, network.sequence(wall, cold=2, warm=1), strict=True):
         # 99 of 100 pixels agree, as export promises: between equals, rounding may choose.
         difference = np.abs(found.disparity_px - expected.disparity_px)
-        assert np.quantile(difference, 0.99) < 0.02
+        assert np.quantile(difference, 0.99) < PARITY_PX
 
 
 def test_a_tier_without_weights_is_named(contenders: list[Contender]) -> None:

@@ -41,6 +41,9 @@ class Refinement(nn.Module):
         self.lower = conv(config.fine_low, config.fine_low)
         self.back = silent(conv(config.fine_low, width, kernel=1))
         self.choose = silent(conv(width, SURFACES))
+        # Of a hundred correlations the best is high by chance: it has to earn its choice.
+        with torch.no_grad():
+            self.choose.bias[4:] = -1  # type: ignore[index]  # conv has a bias
         self.second = conv(width + 2 * TAPS + 6, width)
         self.out = silent(conv(width, 3, kernel=1))
         self.upsample = ConvexUpsampler(width)
