@@ -91,7 +91,7 @@ class ModelSettings(_Section):
     iterations: PositiveInt = Field(default=1, description="of a warm step")
     cold_iterations: PositiveInt = Field(default=8, description="of a cold start")
     max_batch: PositiveInt = Field(
-        default=1, description="streams stepped together; a CPU takes them quicker singly"
+        default=1, description="streams stepped together on a GPU; a CPU steps each by itself"
     )
 
 
