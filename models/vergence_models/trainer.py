@@ -13,6 +13,7 @@ from torch import Tensor
 from vergence_models.config import Config, Precision
 from vergence_models.data.clips import StereoClips
 from vergence_models.motion import perturbed, uvd_transforms
+from vergence_models.network import State
 from vergence_models.runs import (
     CHECKPOINT_NAME,
     Progress,
@@ -29,6 +30,24 @@ def learning_rate(config: Config, step: int) -> float:
     warm = min(1.0, (step + 1) / training.warmup_steps)
     done = min(1.0, step / training.decay_steps)
     return training.learning_rate * warm * (0.1 + 0.45 * (1 + math.cos(math.pi * done)))
+
+
+def partly_foreign(state: State, random: np.random.Generator) -> State:
+    """The state with a window of it from another clip of the batch: surfaces to let go of again.
+
+    What a wrong pose or something that moved leaves behind, but anywhere and of any size.
+    """
+    (top, bottom), (left, right) = np.sort(random.random((2, 2)), axis=1)
+
+    def mixed(tensor: Tensor) -> Tensor:
+        height, width = tensor.shape[2:]
+        rows = slice(round(top * height), round(bottom * height))
+        columns = slice(round(left * width), round(right * width))
+        result = tensor.clone()
+        result[:, :, rows, columns] = tensor.roll(1, dims=0)[:, :, rows, columns]
+        return result
+
+    return tuple(mixed(tensor) for tensor in state)
 
 
 class Trainer:
@@ -125,6 +144,8 @@ class Trainer:
             reset = frame == 0 or self.chance(training.reset_share)
             if reset:
                 state = cold
+            elif self.chance(training.foreign_share):
+                state = partly_foreign(state, self.random)
             most = training.cold_iterations
             iterations = (
                 int(self.random.integers(1, most + 1)) if reset else 1 + int(self.chance(0.2))

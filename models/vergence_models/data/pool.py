@@ -101,7 +101,7 @@ class ClipPool:
         Args:
             rng: the only source of randomness.
             batch: how many clips, drawn with replacement.
-            frames: how many frames of each, by default all.
+            frames: how many frames of each, by default all; a shorter clip is played to and fro.
             crop: width and height of a random window, by default the whole image.
             reverse: of playing a clip backwards.
             skip: of taking every other frame, where a clip is long enough.
@@ -111,14 +111,21 @@ class ClipPool:
         for index in rng.integers(len(self), size=batch):
             clip = self.clips([int(index)])
             wanted = frames or clip.frames
-            stride = 2 if rng.random() < skip and clip.frames >= 2 * wanted - 1 else 1
-            first = int(rng.integers(clip.frames - (wanted - 1) * stride))
-            order = np.arange(first, first + wanted * stride, stride)[:wanted]
+            stride = 2 if rng.random() < skip and clip.frames >= 3 else 1
+            first = int(rng.integers(max(1, clip.frames - (wanted - 1) * stride)))
+            order = _to_and_fro(first + stride * np.arange(wanted), clip.frames)
             clip = _frames(clip, order[::-1] if rng.random() < reverse else order)
             if crop is not None:
                 clip = _crop(clip, rng, *crop)
             parts.append(_upside_down(clip) if rng.random() < flip else clip)
         return StereoClips.concatenate(parts)
+
+
+def _to_and_fro(steps: NDArray[np.int_], frames: int) -> NDArray[np.int_]:
+    """The frames that are shown at these steps of a clip which turns round at either end."""
+    last = max(frames - 1, 1)
+    order: NDArray[np.int_] = np.minimum(last - np.abs(steps % (2 * last) - last), frames - 1)
+    return order
 
 
 def _read(shard: _Shard, row: int) -> StereoClips:

@@ -164,12 +164,12 @@ class CoarseUpdate(nn.Module):
         far: Tensor,
         hole: Tensor,
         scores: Volume,
-        top: Tensor,
         context: Tensor,
     ) -> tuple[Tensor, Tensor]:
         """Hidden state and disparity [B, 1, H, W] px to the next ones."""
         guess_px, guess_log = guess
         fills = torch.cat((fill, far), dim=1)
+        top = scores.scores.amax(dim=-1)[:, None]
         around = lookup_row(scores, coarse_position(d, scores.last), REACH)
         at_fills = lookup(scores, coarse_position(fills, scores.last))
         log_p = (torch.cat((around, at_fills), dim=1) - top).clamp(-20, 0)

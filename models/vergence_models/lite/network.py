@@ -4,6 +4,10 @@ The wide search is coarse (every disparity, cells of 1/8), the narrow one fine (
 hypotheses per cell of 1/4); time joins them: the previous disparity, moved to the new view, is one
 more hypothesis in both. Choosing and blending is learned; matching itself starts from fixed census
 descriptors, so the untrained network is already a stereo matcher.
+
+An iteration is all that depends on what is expected: both choices and the recurrent cell. The next
+iteration expects its answer, as the next frame does; so a second one is what seeing the same frame
+again would be, and a network that improves over frames improves over iterations.
 """
 
 from __future__ import annotations
@@ -27,9 +31,9 @@ from vergence_models.lite.coarse import (
 )
 from vergence_models.lite.context import Context
 from vergence_models.lite.losses import search_cross_entropy
-from vergence_models.lite.refinement import REACH, Refinement
-from vergence_models.lite.sharp import FINE_PX, sharp_search
-from vergence_models.lite.volume import near_pairs, whole_rows
+from vergence_models.lite.refinement import REACH, Refined, Refinement
+from vergence_models.lite.sharp import FINE_PX, SharpSearch, sharp_search
+from vergence_models.lite.volume import Volume, near_pairs, whole_rows
 from vergence_models.losses import known, masked_mean, output_loss, robust
 from vergence_models.network import Estimate, State, StereoNetwork
 from vergence_models.warp import warp_state
@@ -37,10 +41,28 @@ from vergence_proto.model_io import StateTensor
 
 
 class LiteState(NamedTuple):
-    """What one step hands to the next."""
+    """What one step hands to the next, and within it one iteration to the next."""
 
     disparity: Tensor  # float32 [B, 1, H/4, W/4], full-resolution pixels, 0 = nothing known
     hidden: Tensor  # float32 [B, C, H/8, W/8]
+
+
+class Evidence(NamedTuple):
+    """What two images say by themselves: made once, whatever the iterations."""
+
+    fine: Volume  # at 1/4
+    sharp: SharpSearch
+    coarse: Tensor  # [B, H/8, W/8, D]: correlation, largest disparity first
+    context4: Tensor  # [B, C, H/4, W/4]
+    context8: Tensor
+    context16: Tensor
+
+
+class Guesses(NamedTuple):
+    """What each iteration found."""
+
+    eighths: list[Tensor]  # [B, 1, H/8, W/8] px
+    quarters: list[Tensor]  # [B, 1, H/4, W/4] px
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,21 +71,17 @@ class LiteEstimate(Estimate):
 
     coarse_scores: Tensor  # [B, H/8, W/8, D]: unnormalised log-probability, largest disparity first
     sharp_scores: Tensor  # [B, H/8, W/8, D']: correlation of fine descriptors, as above
-    eighths: list[Tensor]  # [B, 1, H/8, W/8] px: the first guess, then after each iteration
-    quarter: Tensor  # [B, 1, H/4, W/4] px
+    guesses: Guesses
 
     def loss(self, truth_px: Tensor, max_disparity_px: int) -> Tensor:
         """Of the answer, its sigma, both scales on the way, and the coarse scores themselves."""
         loss = output_loss(self.disparity, self.sigma, truth_px, max_disparity_px)
-        quarter = truth_px[:, None, 2::4, 2::4]
-        error = (self.quarter - quarter).abs()
-        loss = loss + 0.3 * masked_mean(robust(error), known(quarter, max_disparity_px))
-        eighth = truth_px[:, None, 4::8, 4::8]
-        mask = known(eighth, max_disparity_px)
-        for inner in self.eighths[1:]:
-            loss = loss + 0.3 / (len(self.eighths) - 1) * masked_mean(
-                robust((inner - eighth).abs()), mask
-            )
+        for scale, inner in ((4, self.guesses.quarters), (8, self.guesses.eighths)):
+            truth = truth_px[:, None, scale // 2 :: scale, scale // 2 :: scale]
+            mask = known(truth, max_disparity_px)
+            for guess in inner:
+                error = masked_mean(robust((guess - truth).abs()), mask)
+                loss = loss + 0.3 / len(inner) * error
         loss = loss + 0.2 * search_cross_entropy(
             self.coarse_scores, truth_px, max_disparity_px, bin_px=BIN_PX
         )
@@ -97,58 +115,66 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         state: State,
         iterations: int,
     ) -> tuple[LiteEstimate, LiteState]:
-        previous = LiteState(*state)
+        evidence = self.search(left, right)
+        disparity, hidden = LiteState(*state)
+        prior, _, hidden = warp_state(
+            disparity, hidden, uvd_curr_from_prev, scale=4, hidden_scale=8
+        )
+        following = LiteState(prior, hidden)
+        guesses = Guesses([], [])
+        for _ in range(iterations):
+            answer, following, scores = self.iterate(evidence, following, guesses)
+        disparity, sigma = self.refinement.enlarged(answer)
+        estimate = LiteEstimate(disparity, sigma, scores, evidence.sharp.scores, guesses)
+        return estimate, following
+
+    def search(self, left: Tensor, right: Tensor) -> Evidence:
+        """What the images say by themselves; [B, H, W, 3] uint8 each."""
         left_rows, right_rows = interleave(left), interleave(right)
         left_half, right_half = half_gray(left_rows), half_gray(right_rows)
         left_fine = self.fine_descriptor(left_half, 2)
         right_fine = self.fine_descriptor(right_half, 1)
-        fine = near_pairs(
-            left_fine,
-            right_fine,
-            reach=self.config.max_disparity_px // FINE_PX,
-            margin=REACH + 2,
+        reach = self.config.max_disparity_px // FINE_PX
+        fine = near_pairs(left_fine, right_fine, reach=reach, margin=REACH + 2)
+        sharp = sharp_search(left_fine, right_fine, reach)
+        pairs = all_pairs(
+            self.coarse_descriptor(F.avg_pool2d(left_half, 2), 2),
+            self.coarse_descriptor(F.avg_pool2d(right_half, 2), 1),
         )
-        sharp = sharp_search(left_fine, right_fine, self.config.max_disparity_px // FINE_PX)
-        coarse = banded(
-            all_pairs(
-                self.coarse_descriptor(F.avg_pool2d(left_half, 2), 2),
-                self.coarse_descriptor(F.avg_pool2d(right_half, 2), 1),
-            ),
-            self.config.max_disparity_px // BIN_PX,
-        )
-        context4, context8, context16 = self.context(left_rows)
+        coarse = banded(pairs, self.config.max_disparity_px // BIN_PX)
+        return Evidence(fine, sharp, coarse, *self.context(left_rows))
 
-        prior, hole, hidden = warp_state(
-            previous.disparity, previous.hidden, uvd_curr_from_prev, scale=4, hidden_scale=8
-        )
-        seen8 = F.avg_pool2d(1 - hole, 2)
+    def iterate(
+        self, evidence: Evidence, state: LiteState, guesses: Guesses
+    ) -> tuple[Refined, LiteState, Tensor]:
+        """From the surface that is expected to a better one, by both searches.
+
+        Returns the answer at 1/4, the state that expects it, and the coarse scores.
+        """
+        prior, hidden = state
+        seen = (prior > 0).to(prior.dtype)
+        seen8 = F.avg_pool2d(seen, 2)
         hole8 = (seen8 <= 0).to(prior.dtype)
         prior8 = F.avg_pool2d(prior, 2) / seen8.clamp(min=0.1)
-
-        scores = whole_rows(self.cost_filter(coarse, context16, prior8))
-        top = scores.scores.amax(dim=-1)[:, None]
+        scores = whole_rows(self.cost_filter(evidence.coarse, evidence.context16, prior8))
         guess = peak(scores)
         confidence = torch.exp(4 * guess[1])
         fill = smooth_fill(guess[0], confidence)
         far = far_fill(guess[0], confidence, fill)
-        d = prior8 + hole8 * (fill - prior8)
-        eighths = [guess[0]]
-        for _ in range(iterations):
-            hidden, d = self.update(
-                hidden,
-                d,
-                guess=guess,
-                fill=fill,
-                far=far,
-                hole=hole8,
-                scores=scores,
-                top=top,
-                context=context8,
-            )
-            eighths.append(d)
-        disparity, sigma, quarter = self.refinement(fine, d, sharp, hidden, prior, context4)
-        estimate = LiteEstimate(disparity, sigma, scores.scores, sharp.scores, eighths, quarter)
-        return estimate, LiteState(quarter, hidden)
+        hidden, d = self.update(
+            hidden,
+            prior8 + hole8 * (fill - prior8),
+            guess=guess,
+            fill=fill,
+            far=far,
+            hole=hole8,
+            scores=scores,
+            context=evidence.context8,
+        )
+        answer = self.refinement(evidence.fine, d, evidence.sharp, hidden, prior, evidence.context4)
+        guesses.eighths.append(d)
+        guesses.quarters.append(answer.disparity)
+        return answer, LiteState(answer.disparity, hidden), scores.scores
 
 
 def interleave(image: Tensor) -> Tensor:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -26,6 +28,14 @@ from vergence_models.warp import cell_centres
 SURFACES = 7  # hypotheses of a cell
 REACH = 2  # entries looked up on either side of the current disparity
 TAPS = 2 * REACH + 1
+
+
+class Refined(NamedTuple):
+    """An answer at 1/4, and what it takes to bring it to full size."""
+
+    disparity: Tensor  # [B, 1, H/4, W/4] px
+    doubt: Tensor  # likewise: a logarithm of sigma, up to scale and bounds
+    features: Tensor  # [B, C, H/4, W/4]
 
 
 class Refinement(nn.Module):
@@ -58,8 +68,8 @@ class Refinement(nn.Module):
         hidden: Tensor,
         prior: Tensor,
         context: Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Full-size disparity and sigma [B, H, W], and the disparity at 1/4 [B, 1, H/4, W/4]."""
+    ) -> Refined:
+        """Choose and fit; hypotheses are those of 1/8, of the sharp search, and the prior px."""
         u, _ = cell_centres(prior.shape[2], prior.shape[3], 4, prior)
         column = (u - 1.5) * (1 / FINE_PX)
 
@@ -101,7 +111,11 @@ class Refinement(nn.Module):
         # The previous frame's surface is evidence too, while it agrees: half of a small step.
         keep = torch.sigmoid(4 * out[:, 1:2]) * torch.exp(-step.abs()) * (1 - hole)
         d = (d + keep * step + 2 * out[:, :1]).clamp(min=MIN_PX)
+        return Refined(d, out[:, 2:], x)
+
+    def enlarged(self, found: Refined) -> tuple[Tensor, Tensor]:
+        """Full-size disparity and sigma, px [B, H, W]."""
         # Half a pixel at first; within e^-3.5 and e^4 times that.
-        sigma = 0.5 * torch.exp((4 * out[:, 2:]).clamp(-3.5, 4.0))
-        full = self.upsample(x, d).clamp(min=MIN_PX)
-        return full, F.interpolate(sigma, scale_factor=4.0, mode="bilinear")[:, 0], d
+        sigma = 0.5 * torch.exp((4 * found.doubt).clamp(-3.5, 4.0))
+        full = self.upsample(found.features, found.disparity).clamp(min=MIN_PX)
+        return full, F.interpolate(sigma, scale_factor=4.0, mode="bilinear")[:, 0]
