@@ -11,7 +11,7 @@ from torch import Tensor
 
 def robust(error_px: Tensor) -> Tensor:
     """L1 with a logarithm: far outliers still pull, and halving a small error still pays."""
-    return 0.5 * error_px + torch.log1p(error_px)
+    return 0.25 * error_px + 1.5 * torch.log1p(error_px)
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:

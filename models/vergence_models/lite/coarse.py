@@ -13,10 +13,10 @@ from vergence_models.layers import (
     box3,
     conv,
     enlarge,
-    shares,
     silent,
     squash,
 )
+from vergence_models.lite.hypotheses import Hypotheses
 from vergence_models.lite.volume import Volume, gathered, lookup, lookup_row
 from vergence_models.warp import cell_centres
 
@@ -165,8 +165,8 @@ class CoarseUpdate(nn.Module):
         hole: Tensor,
         scores: Volume,
         context: Tensor,
-    ) -> tuple[Tensor, Tensor]:
-        """Hidden state and disparity [B, 1, H, W] px to the next ones."""
+    ) -> tuple[Tensor, Tensor, Hypotheses]:
+        """Hidden state and disparity [B, 1, H, W] px to the next ones; what was chosen among."""
         guess_px, guess_log = guess
         fills = torch.cat((fill, far), dim=1)
         top = scores.scores.amax(dim=-1)[:, None]
@@ -192,7 +192,7 @@ class CoarseUpdate(nn.Module):
         # Fixed part of the choice: the score itself, and a doubt about guesses that are not unique.
         kept, at_fill, at_far = (log_p[:, k : k + 1] for k in (REACH, TAPS, TAPS + 1))
         fixed = torch.cat((kept + 1, 2 * guess_log, at_fill - 1, at_far - 1), dim=1)
-        choice = shares(fixed + 4 * learned[:, :4], dim=1)
         surfaces = torch.cat((d, guess_px, fills), dim=1)
-        chosen = (choice * surfaces).sum(dim=1, keepdim=True)
-        return hidden, (chosen + 4 * learned[:, 4:]).clamp(min=MIN_PX)
+        hypotheses = Hypotheses(surfaces, fixed + 4 * learned[:, :4])
+        d = (hypotheses.mean() + 4 * learned[:, 4:]).clamp(min=MIN_PX)
+        return hidden, d, hypotheses

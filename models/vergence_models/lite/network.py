@@ -20,7 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from vergence_models.config import LiteNetworkConfig
-from vergence_models.layers import CensusDescriptor, all_pairs, banded
+from vergence_models.layers import CensusDescriptor, added, all_pairs, banded
 from vergence_models.lite.coarse import (
     BIN_PX,
     CoarseUpdate,
@@ -30,6 +30,7 @@ from vergence_models.lite.coarse import (
     smooth_fill,
 )
 from vergence_models.lite.context import Context
+from vergence_models.lite.hypotheses import Hypotheses
 from vergence_models.lite.losses import search_cross_entropy
 from vergence_models.lite.refinement import REACH, Refined, Refinement
 from vergence_models.lite.sharp import FINE_PX, SharpSearch, sharp_search
@@ -58,11 +59,18 @@ class Evidence(NamedTuple):
     context16: Tensor
 
 
-class Guesses(NamedTuple):
-    """What each iteration found."""
+class Guess(NamedTuple):
+    """What an iteration found at one scale, and what it chose among."""
 
-    eighths: list[Tensor]  # [B, 1, H/8, W/8] px
-    quarters: list[Tensor]  # [B, 1, H/4, W/4] px
+    disparity: Tensor  # [B, 1, H/scale, W/scale] px
+    hypotheses: Hypotheses
+    scale: int
+
+    def loss(self, truth_px: Tensor, max_disparity_px: int) -> Tensor:
+        truth = truth_px[:, None, self.scale // 2 :: self.scale, self.scale // 2 :: self.scale]
+        error = robust((self.disparity - truth).abs())
+        unlikely = self.hypotheses.unlikelihood(truth_px, max_disparity_px, scale=self.scale)
+        return 0.3 * masked_mean(error, known(truth, max_disparity_px)) + 0.3 * unlikely
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,17 +79,13 @@ class LiteEstimate(Estimate):
 
     coarse_scores: Tensor  # [B, H/8, W/8, D]: unnormalised log-probability, largest disparity first
     sharp_scores: Tensor  # [B, H/8, W/8, D']: correlation of fine descriptors, as above
-    guesses: Guesses
+    guesses: list[Guess]  # at both scales, of each iteration
 
     def loss(self, truth_px: Tensor, max_disparity_px: int) -> Tensor:
         """Of the answer, its sigma, both scales on the way, and the coarse scores themselves."""
         loss = output_loss(self.disparity, self.sigma, truth_px, max_disparity_px)
-        for scale, inner in ((4, self.guesses.quarters), (8, self.guesses.eighths)):
-            truth = truth_px[:, None, scale // 2 :: scale, scale // 2 :: scale]
-            mask = known(truth, max_disparity_px)
-            for guess in inner:
-                error = masked_mean(robust((guess - truth).abs()), mask)
-                loss = loss + 0.3 / len(inner) * error
+        losses = [guess.loss(truth_px, max_disparity_px) for guess in self.guesses]
+        loss = loss + 2 / len(losses) * added(losses)
         loss = loss + 0.2 * search_cross_entropy(
             self.coarse_scores, truth_px, max_disparity_px, bin_px=BIN_PX
         )
@@ -121,7 +125,7 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
             disparity, hidden, uvd_curr_from_prev, scale=4, hidden_scale=8
         )
         following = LiteState(prior, hidden)
-        guesses = Guesses([], [])
+        guesses: list[Guess] = []
         for _ in range(iterations):
             answer, following, scores = self.iterate(evidence, following, guesses)
         disparity, sigma = self.refinement.enlarged(answer)
@@ -145,7 +149,7 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         return Evidence(fine, sharp, coarse, *self.context(left_rows))
 
     def iterate(
-        self, evidence: Evidence, state: LiteState, guesses: Guesses
+        self, evidence: Evidence, state: LiteState, guesses: list[Guess]
     ) -> tuple[Refined, LiteState, Tensor]:
         """From the surface that is expected to a better one, by both searches.
 
@@ -161,7 +165,7 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         confidence = torch.exp(4 * guess[1])
         fill = smooth_fill(guess[0], confidence)
         far = far_fill(guess[0], confidence, fill)
-        hidden, d = self.update(
+        hidden, d, hypotheses = self.update(
             hidden,
             prior8 + hole8 * (fill - prior8),
             guess=guess,
@@ -172,8 +176,8 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
             context=evidence.context8,
         )
         answer = self.refinement(evidence.fine, d, evidence.sharp, hidden, prior, evidence.context4)
-        guesses.eighths.append(d)
-        guesses.quarters.append(answer.disparity)
+        guesses.append(Guess(d, hypotheses, 8))
+        guesses.append(Guess(answer.disparity, answer.hypotheses, 4))
         return answer, LiteState(answer.disparity, hidden), scores.scores
 
 

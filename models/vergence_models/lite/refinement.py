@@ -21,6 +21,7 @@ from vergence_models.layers import (
     squash,
 )
 from vergence_models.lite.coarse import MIN_PX, beyond
+from vergence_models.lite.hypotheses import Hypotheses
 from vergence_models.lite.sharp import FINE_PX, SharpSearch, rims
 from vergence_models.lite.volume import Volume, lookup, lookup_row
 from vergence_models.warp import cell_centres
@@ -36,6 +37,7 @@ class Refined(NamedTuple):
     disparity: Tensor  # [B, 1, H/4, W/4] px
     doubt: Tensor  # likewise: a logarithm of sigma, up to scale and bounds
     features: Tensor  # [B, C, H/4, W/4]
+    hypotheses: Hypotheses
 
 
 class Refinement(nn.Module):
@@ -91,8 +93,8 @@ class Refinement(nn.Module):
         low = F.relu6(self.lower(F.relu6(self.low(F.relu6(self.down(x))))))
         x = F.relu(x + enlarge(self.back(low)))
         fixed = cost * self.sharpness[0] + wide * self.sharpness[1]
-        choice = shares(fixed + 4 * self.choose(x), dim=1)
-        d = (choice * surfaces).sum(dim=1, keepdim=True)
+        hypotheses = Hypotheses(surfaces, fixed + 4 * self.choose(x))
+        d = hypotheses.mean()
 
         # Sub-pixel: the centre of the peak that the window's mean makes along the surface. A
         # larger position is a smaller disparity.
@@ -111,7 +113,7 @@ class Refinement(nn.Module):
         # The previous frame's surface is evidence too, while it agrees: half of a small step.
         keep = torch.sigmoid(4 * out[:, 1:2]) * torch.exp(-step.abs()) * (1 - hole)
         d = (d + keep * step + 2 * out[:, :1]).clamp(min=MIN_PX)
-        return Refined(d, out[:, 2:], x)
+        return Refined(d, out[:, 2:], x, hypotheses)
 
     def enlarged(self, found: Refined) -> tuple[Tensor, Tensor]:
         """Full-size disparity and sigma, px [B, H, W]."""
