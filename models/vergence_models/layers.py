@@ -70,26 +70,29 @@ def banded(pairs: Tensor, disparities: int) -> Tensor:
     return skewed * (d <= x * ratio).to(pairs.dtype)
 
 
-def best_rival(scores: Tensor, columns: int) -> Tensor:
+def best_rival(scores: Tensor, ratio: int) -> Tensor:
     """For each match (x, d), the best score that its right pixel has with any left pixel.
 
-    A match that scores below it is claimed by another surface: the sign of an occlusion. The way
-    back through :func:`banded`: from disparities to columns of the right image, a maximum, and a
-    gather. ``scores`` [B, H, W, D] as from :func:`banded`; the result has the same shape.
+    A match that scores below it is claimed by another surface: the sign of an occlusion.
+    ``scores`` [B, D, H, W], largest disparity first, as many as a multiple of ``ratio``: so much
+    further along the right row is the next cell. The result has the same shape.
+
+    ``ratio`` disparities are a group; the next group's matches with the same right pixels are one
+    cell further left. So in rows that have some space left, and groups that are one entry shorter
+    than they are, these matches stand one above the other.
     """
-    batch, height, width, disparities = scores.shape
-    ratio = columns // width
-    first = disparities - 1
-    x = torch.arange(width, device=scores.device)[:, None]
-    right = ratio * x - torch.arange(first, -1, -1, device=scores.device)[None, :]
-    nothing = torch.full_like(scores[:1, :1], -1e4)
-    known = torch.where(right >= 0, scores, nothing)
-    rows = F.pad(known, (0, columns + ratio - disparities), value=-1e4)
-    flat = rows.view(batch, height, width * (columns + ratio))
-    pairs = flat[..., first : first + width * columns].view(batch, height, width, columns)
-    best = pairs.amax(dim=2)
-    found = best.index_select(2, right.clamp(min=0).flatten())
-    return found.view(batch, height, width, disparities)
+    batch, disparities, height, width = scores.shape
+    groups, wide = disparities // ratio, width + disparities // ratio
+    size = ratio * height * wide
+    flat = F.pad(scores, (0, groups), value=-1e4).reshape(batch, groups * size)
+    meeting = flat[:, groups - 1 : groups * size - 1].view(batch, groups, size - 1)
+    best = F.pad(meeting.amax(dim=1), (0, 1)).view(batch, ratio, height, wide)
+    # And the same way back. What lies outside of the image, to the left, has the first one's rival.
+    first = best[:, -1:, :, :1].expand(-1, ratio, -1, groups)
+    best = torch.cat((first, best[..., 1 : width + 1]), dim=3).view(batch, 1, size)
+    again = best[..., : size - 1].expand(-1, groups + 1, -1).reshape(batch, -1)
+    rivals = again[:, : groups * size].view(batch, disparities, height, wide)
+    return rivals[..., :width]
 
 
 def lookup_row(volume: Tensor, position: Tensor, reach: int) -> Tensor:
@@ -124,10 +127,13 @@ def standardized(x: Tensor) -> Tensor:
     return centred * torch.rsqrt(centred.square().mean(dim=(2, 3), keepdim=True) + 1e-5)
 
 
-def shares(scores: Tensor, dim: int) -> Tensor:
-    """Softmax as exp and sum: the operator is twenty times slower off the last axis."""
-    weights = torch.exp(scores - scores.amax(dim=dim, keepdim=True))
-    return weights / weights.sum(dim=dim, keepdim=True)
+def expected(scores: Tensor, values: Tensor) -> Tensor:
+    """Mean of ``values`` by the softmax of ``scores``: [B, C, H, W] to [B, 1, H, W].
+
+    By exp and sum: onnxruntime's softmax is twenty times slower off the last axis.
+    """
+    weights = torch.exp(scores - scores.amax(dim=1, keepdim=True))
+    return (weights * values).sum(dim=1, keepdim=True) / weights.sum(dim=1, keepdim=True)
 
 
 def conv(inputs: int, outputs: int, *, kernel: int = 3, stride: int = 1) -> nn.Conv2d:
@@ -204,22 +210,29 @@ class ConvexUpsampler(nn.Module):
         # the pixels in the order they are wanted in, a cell's shares are one block of channels.
         assert self.mask.bias is not None
         both = torch.cat((self.mask.weight.flatten(1), self.mask.bias[:, None]), dim=1)
-        both = both.view(2, 2, 4, 2, 2, -1).permute(2, 0, 3, 1, 4, 5).reshape(64, -1)
-        scores = F.conv2d(features, both[:, :-1, None, None], both[:, -1])
-        # Bounded scores need no maximum to be subtracted before the exponential.
-        weights = torch.exp(scores.clamp(-12, 12)).view(batch, 4, 2, 2, 2, 2, height, width)
-        padded = F.pad(disparity, (1, 1, 1, 1), mode="replicate")[:, 0]
-        own = padded[:, None, 1:-1].expand(-1, 2, -1, -1)
-        other = torch.stack((padded[:, :-2], padded[:, 2:]), dim=1)  # row above, row below
-
-        def cells(rows: Tensor) -> tuple[Tensor, Tensor]:
-            """Of each quadrant, in its own column and in the one on its side: [B, 2, 2, h, w]."""
-            beside = torch.stack((rows[..., :-2], rows[..., 2:]), dim=2)
-            return rows[:, :, None, :, 1:-1].expand_as(beside), beside
-
-        near = torch.stack((*cells(own), *cells(other)), dim=1)[:, :, :, None, :, None]
-        blocks = (weights * near).sum(dim=1) / weights.sum(dim=1)
-        return F.pixel_shuffle(blocks.reshape(batch, 16, height, width), 4)[:, 0]
+        both = both.view(2, 2, 4, 2, 2, -1).permute(2, 0, 3, 1, 4, 5).reshape(4, 16, -1)
+        padded = F.pad(disparity, (1, 1, 1, 1), mode="replicate")
+        rows = torch.cat((padded[:, :, :-2], padded[:, :, 2:]), dim=1)  # above, below
+        beside = torch.cat((padded[:, :, 1:-1, :-2], padded[:, :, 1:-1, 2:]), dim=1) - disparity
+        other = rows[..., 1:-1] - disparity
+        corner = torch.stack((rows[..., :-2], rows[..., 2:]), dim=2) - disparity[:, None]
+        # Seen from [B, quadrant y, pixel y, quadrant x, pixel x, h, w]:
+        near = (
+            beside[:, None, None, :, None],
+            other[:, :, None, None, None],
+            corner[:, :, None, :, None],
+        )
+        shares, steps = [], []
+        # A softmax needs no more than differences of scores; with those to the own cell's, that
+        # cell needs neither an exponential nor a product.
+        for weights, step in zip(both[1:] - both[:1], near, strict=True):
+            scores = F.conv2d(features, weights[:, :-1, None, None], weights[:, -1])
+            # Bounded scores need no maximum to be subtracted before the exponential.
+            share = torch.exp(scores.clamp(-24, 24)).view(batch, 2, 2, 2, 2, height, width)
+            shares.append(share)
+            steps.append(share * step)
+        blocks = (added(steps) / (added(shares) + 1)).view(batch, 16, height, width) + disparity
+        return F.pixel_shuffle(blocks, 4).squeeze(1)
 
 
 def added(terms: list[Tensor]) -> Tensor:

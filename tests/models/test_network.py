@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 from pathlib import Path
 
@@ -125,20 +126,18 @@ def test_banded_reindexes_pairs_by_disparity(ratio: int) -> None:
             assert torch.equal(volume[:, :, x, 5 - d], expected)
 
 
-def test_best_rival_is_the_best_score_of_the_right_pixel() -> None:
-    scores = torch.randn(1, 2, 8, 5)
-    rival = best_rival(scores, 16)
-    for x in range(8):
-        for d in range(5):
-            right = 2 * x - d
-            if right < 0:
-                continue
-            claims = [
-                scores[0, 1, other, 4 - (2 * other - right)]
-                for other in range(8)
-                if 0 <= 2 * other - right < 5
-            ]
-            assert rival[0, 1, x, 4 - d] == max(claims)
+@pytest.mark.parametrize("ratio", [1, 2, 3])
+def test_best_rival_is_the_best_score_of_the_right_pixel(ratio: int) -> None:
+    bins = 6
+    scores = torch.randn(2, bins, 3, 8)
+    rival = best_rival(scores, ratio)
+    for x, d in itertools.product(range(8), range(bins)):
+        right = max(ratio * x - d, 0)
+        meeting = [(other, ratio * other - right) for other in range(8)]
+        claims = [
+            scores[:, bins - 1 - there, :, other] for other, there in meeting if 0 <= there < bins
+        ]
+        assert torch.equal(rival[:, bins - 1 - d, :, x], torch.stack(claims).amax(dim=0))
 
 
 def test_all_pairs_is_the_mean_product_of_descriptors() -> None:

@@ -2,30 +2,57 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 import torch
 
-from vergence_models.layers import all_pairs, conv, joint
-from vergence_models.lite.volume import Volume, lookup, lookup_row, near_pairs, whole_rows
+from vergence_models.layers import all_pairs, banded, conv, joint
+from vergence_models.lite.sharp import FINE_PX, sharp_search
+from vergence_models.lite.volume import (
+    Volume,
+    gathered,
+    lookup,
+    lookup_row,
+    near_pairs,
+    whole_rows,
+)
 
 
 @pytest.mark.parametrize("ratio", [1, 2])
-def test_near_pairs_are_those_of_all_pairs_within_reach(ratio: int) -> None:
-    reach, margin, width = 12, 3, 32
-    left, right = torch.randn(2, 4, 3, width), torch.randn(2, 4, 3, ratio * width)
+@pytest.mark.parametrize("width", [32, 56])  # whole blocks of columns or not
+def test_near_pairs_are_those_of_all_pairs_within_reach(ratio: int, width: int) -> None:
+    reach, margin = 12, 3
+    left, right = torch.randn(2, 4, 6, width), torch.randn(2, 4, 6, ratio * width)
     near, everything = near_pairs(left, right, reach=reach, margin=margin), all_pairs(left, right)
-    assert near.scores.shape[3] < ratio * width
-    for x in range(width):
-        for entry in range(ratio * x - reach - margin, ratio * x + margin + 1):
-            if 0 <= entry < ratio * width:
-                got = near.scores[:, :, x, entry - int(near.first[x])]
-                assert torch.allclose(got, everything[:, :, x, entry], atol=1e-6)
+    x = torch.arange(width).expand(2, 1, 6, width)
+    for offset in range(-reach - margin, margin + 1):
+        entry = ratio * x + offset
+        inside = (entry >= 0) & (entry < ratio * width)
+        expected = everything.gather(3, entry.clamp(0, ratio * width - 1)[:, 0, :, :, None])
+        difference = gathered(near, entry.float())[:, 0] - expected[..., 0]
+        assert difference[inside[:, 0]].abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("width", [32, 56])
+def test_a_sharp_score_is_the_mean_of_those_of_four_cells(width: int) -> None:
+    left, right = torch.randn(2, 4, 6, width), torch.randn(2, 4, 6, 2 * width)
+    sharp = sharp_search(near_pairs(left, right, reach=12, margin=3), 12)
+    cells, scores = banded(all_pairs(left, right), 12), sharp.scores()
+    for x, d in itertools.product(range(width // 2), range(12)):
+        four = cells[:, :, 2 * x : 2 * x + 2, 11 - d].view(2, 3, 2, 2)
+        # What lies outside of the image is no match.
+        expected = four.mean(dim=(2, 3)) if d <= 4 * x else torch.zeros(2, 3)
+        assert torch.allclose(scores[:, :, x, 11 - d], expected, atol=1e-6)
+    assert torch.allclose(sharp.correlation[:, 0], scores.amax(dim=3))
+    winner = 11 - sharp.disparity / FINE_PX
+    assert torch.equal(scores.gather(3, winner[:, 0, :, :, None].long()).squeeze(3), scores.amax(3))
 
 
 def squares(first: float = 0.0) -> Volume:
     """Of a row of eight squares, all of it or what is left of it from ``first`` on."""
     row = torch.arange(8.0)[int(first) :].view(1, 1, 1, -1) ** 2
-    return Volume(row, torch.tensor([first]), 7)
+    return Volume(row, torch.zeros(1, 1, 1, 1, dtype=torch.int64), torch.tensor([first]), 7)
 
 
 @pytest.mark.parametrize("first", [0.0, 2.0])

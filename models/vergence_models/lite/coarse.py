@@ -58,8 +58,7 @@ class CostFilter(nn.Module):
         wide = box3(box3(middle))
         fixed = narrow * self.sharpness[0] + middle * self.sharpness[1] + wide * self.sharpness[2]
         lead = (fixed - fixed.amax(dim=1, keepdim=True)) * 0.1
-        rival = best_rival(fixed.permute(0, 2, 3, 1), 2 * width).permute(0, 3, 1, 2)
-        claim = (fixed - rival).clamp(max=0) * 0.1
+        claim = (fixed - best_rival(fixed, 2)).clamp(max=0) * 0.1
         bin_px = torch.arange(bins - 1, -1, -1, device=volume.device).to(volume.dtype) * BIN_PX
         bin_px = bin_px[None, :, None, None]
         near = 1 - (prior - bin_px).abs() * (1 / (2 * BIN_PX))

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from vergence_models.layers import shares
+from vergence_models.layers import expected
 from vergence_models.losses import known, masked_mean
 
 
@@ -20,7 +20,7 @@ class Hypotheses(NamedTuple):
 
     def mean(self) -> Tensor:
         """[B, 1, H, W] px."""
-        return (shares(self.scores, dim=1) * self.surfaces).sum(dim=1, keepdim=True)
+        return expected(self.scores, self.surfaces)
 
     def unlikelihood(self, truth_px: Tensor, max_disparity_px: int, *, scale: int) -> Tensor:
         """Of the truth [B, H, W], under a Laplace distribution round each hypothesis: a scalar.

@@ -78,7 +78,7 @@ class LiteEstimate(Estimate):
     """The answer, and the guesses on the way to it."""
 
     coarse_scores: Tensor  # [B, H/8, W/8, D]: unnormalised log-probability, largest disparity first
-    sharp_scores: Tensor  # [B, H/8, W/8, D']: correlation of fine descriptors, as above
+    sharp: SharpSearch
     guesses: list[Guess]  # at both scales, of each iteration
 
     def loss(self, truth_px: Tensor, max_disparity_px: int) -> Tensor:
@@ -91,7 +91,7 @@ class LiteEstimate(Estimate):
         )
         # A correlation is at most 1: sharpened, it can rule out.
         return loss + 0.05 * search_cross_entropy(
-            15 * self.sharp_scores, truth_px, max_disparity_px, bin_px=FINE_PX
+            15 * self.sharp.scores(), truth_px, max_disparity_px, bin_px=FINE_PX
         )
 
 
@@ -129,7 +129,7 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         for _ in range(iterations):
             answer, following, scores = self.iterate(evidence, following, guesses)
         disparity, sigma = self.refinement.enlarged(answer)
-        estimate = LiteEstimate(disparity, sigma, scores, evidence.sharp.scores, guesses)
+        estimate = LiteEstimate(disparity, sigma, scores, evidence.sharp, guesses)
         return estimate, following
 
     def search(self, left: Tensor, right: Tensor) -> Evidence:
@@ -140,7 +140,7 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         right_fine = self.fine_descriptor(right_half, 1)
         reach = self.config.max_disparity_px // FINE_PX
         fine = near_pairs(left_fine, right_fine, reach=reach, margin=REACH + 2)
-        sharp = sharp_search(left_fine, right_fine, reach)
+        sharp = sharp_search(fine, reach)
         pairs = all_pairs(
             self.coarse_descriptor(F.avg_pool2d(left_half, 2), 2),
             self.coarse_descriptor(F.avg_pool2d(right_half, 2), 1),

@@ -11,12 +11,11 @@ from torch import Tensor, nn
 from vergence_models.config import LiteNetworkConfig
 from vergence_models.layers import (
     ConvexUpsampler,
-    added,
     box3,
     conv,
     enlarge,
+    expected,
     joint,
-    shares,
     silent,
     squash,
 )
@@ -101,8 +100,8 @@ class Refinement(nn.Module):
         looked_at = position(d)
         taps = lookup_row(pairs, looked_at, REACH)
         smooth = box3(taps)
-        fit = shares(self.subpixel * smooth, dim=1)
-        offset = added([fit[:, k : k + 1] * (FINE_PX * (REACH - k)) for k in range(TAPS)])
+        tap_px = torch.arange(REACH, -REACH - 1, -1, device=d.device).to(d.dtype) * FINE_PX
+        offset = expected(self.subpixel * smooth, tap_px[:, None, None])
         d = d + offset
         step = carried - d
         # Interpolated entries flatten a peak between two of them: tell where between them it lies.
@@ -119,5 +118,5 @@ class Refinement(nn.Module):
         """Full-size disparity and sigma, px [B, H, W]."""
         # Half a pixel at first; within e^-3.5 and e^4 times that.
         sigma = 0.5 * torch.exp((4 * found.doubt).clamp(-3.5, 4.0))
-        full = self.upsample(found.features, found.disparity).clamp(min=MIN_PX)
-        return full, F.interpolate(sigma, scale_factor=4.0, mode="bilinear")[:, 0]
+        full = self.upsample(found.features, found.disparity)
+        return full, F.interpolate(sigma, scale_factor=4.0, mode="bilinear").squeeze(1)

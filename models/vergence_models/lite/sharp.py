@@ -11,30 +11,57 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from vergence_models.layers import all_pairs, banded
+from vergence_models.lite.volume import BLOCK, Volume
 
 FINE_PX = 2  # spacing of the fine descriptors along the right row, and so of the disparities
+CELLS = 4  # of the fine volume that vote together
+NEVER = -1e2  # the score of what is no disparity
 
 
 class SharpSearch(NamedTuple):
     """What the fine descriptors of each 2x2 cells of 1/4 say together."""
 
-    scores: Tensor  # [B, H/8, W/8, D]: mean correlation, largest disparity first
+    sums: Tensor  # [B, H/8, W/8, N]: of four correlations, with entries of the right row
+    columns: Tensor  # [W/8, D]: where in them the disparities are, the largest first
     disparity: Tensor  # [B, 1, H/8, W/8] px: the winner
-    correlation: Tensor  # [B, 1, H/8, W/8]: its score
+    correlation: Tensor  # [B, 1, H/8, W/8]: its mean score
+
+    def scores(self) -> Tensor:
+        """[B, H/8, W/8, D]: mean correlation, largest disparity first."""
+        batch, height = self.sums.shape[:2]
+        return self.sums.gather(3, self.columns.expand(batch, height, -1, -1)) * (1 / CELLS)
 
 
-def sharp_search(left: Tensor, right: Tensor, disparities: int) -> SharpSearch:
-    """``left`` [B, bits, H/4, W/4] against ``right`` [B, bits, H/4, W/2], an entry every 2 px."""
-    batch, bits, height, columns = right.shape
+def sharp_search(fine: Volume, disparities: int) -> SharpSearch:
+    """Of the volume of :func:`near_pairs` at 1/4, whose rows have an entry every 2 px."""
+    batch, _, height, width = fine.begin.shape
+    rows, blocks, _, _, window = fine.scores.shape
     # The cells of a block lie one above, one beside the other; beside is two entries further.
-    both = torch.stack((right, F.pad(right[..., 2:], (0, 2))), dim=2)
-    blocks = both.view(batch, bits, 2, height // 2, 2, columns).permute(0, 1, 4, 2, 3, 5)
-    blocks = blocks.reshape(batch, 4 * bits, height // 2, columns)
-    scores = banded(all_pairs(F.pixel_unshuffle(left, 2), blocks), disparities)
-    correlation, best = scores.max(dim=-1)
-    disparity = (disparities - 1 - best).to(scores.dtype) * FINE_PX
-    return SharpSearch(scores, disparity[:, None], correlation[:, None])
+    above = fine.scores.sum(dim=2).view(rows, blocks, BLOCK // 2, 2 * window)
+    sums = above[..., : window - 2] + above[..., window + 2 :]
+    entry = torch.arange(window - 2, device=sums.device)
+    first = fine.first[0].long()
+    zero = 4 * torch.arange(BLOCK // 2, device=sums.device)[:, None] - first
+    d = zero - entry
+    start = torch.arange(blocks, device=sums.device)[:, None, None] * (2 * BLOCK) + first
+    inside = (start + entry >= 0).to(sums.dtype)
+    excluded = ((d < 0) | (d >= disparities)).to(sums.dtype) * NEVER
+    sums = sums * inside + excluded
+    correlation, best = sums.max(dim=-1)
+    disparity = (zero[:, 0] - best).to(sums.dtype) * FINE_PX
+    largest_first = zero - torch.arange(disparities - 1, -1, -1, device=sums.device)
+
+    def in_rows(values: Tensor) -> Tensor:
+        """[B H/8, blocks, BLOCK / 2, ..] to [B, H/8, W/8, ..]."""
+        joined = values.reshape(batch, height // 2, blocks * BLOCK // 2, *values.shape[3:])
+        return joined[:, :, : width // 2]
+
+    return SharpSearch(
+        in_rows(sums),
+        largest_first.repeat(blocks, 1)[: width // 2],
+        in_rows(disparity)[:, None],
+        in_rows(correlation)[:, None] * (1 / CELLS),
+    )
 
 
 def rims(d: Tensor) -> Tensor:
