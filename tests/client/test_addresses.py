@@ -2,6 +2,7 @@
 
 import pytest
 
+from vergence import DepthClient
 from vergence.transports.addresses import on_this_machine
 
 
@@ -20,3 +21,9 @@ from vergence.transports.addresses import on_this_machine
 )
 def test_a_loopback_address_is_this_machine(server: str, here: bool) -> None:
     assert on_this_machine(server) is here
+
+
+@pytest.mark.parametrize("server", ["ftp://host:80", "host", ":50051", "grpc://", "host:port"])
+def test_a_server_that_is_none_is_refused_by_its_spelling(server: str) -> None:
+    with pytest.raises(ValueError, match=r"grpc://HOST:PORT"):
+        DepthClient(server)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.client.filming import EXACT, step
 from tests.client.proxy import Proxy, proxy_to
 from tests.client.waiting import eventually
 from tests.support.frames import RIG, make_frame
@@ -23,14 +24,10 @@ from vergence import (
     EventKind,
     ModelChanged,
     Origin,
-    OutputFormat,
-    PlaneEncoding,
     SessionEvent,
     StreamExpired,
     UnknownStream,
 )
-
-EXACT = OutputFormat(encoding=PlaneEncoding.FLOAT32)
 
 
 class Scene:
@@ -60,11 +57,6 @@ async def scene(*, clock: ManualClock | None = None, **flags: Any) -> AsyncItera
         DepthClient(proxy.address) as client,
     ):
         yield Scene(model, proxy, client)
-
-
-async def step(session: DepthSession, frame_id: int) -> DepthResult:
-    frame = make_frame(frame_id)
-    return await session.step(frame.left, frame.right, frame.pose, capture_ns=frame.capture_ns)
 
 
 async def undisturbed(count: int) -> list[DepthResult]:

@@ -1,4 +1,4 @@
-"""Random values of the contract, made by other formulas than the code under test."""
+"""Values of the contract, the random ones made by other formulas than the code under test."""
 
 import cv2
 import numpy as np
@@ -6,6 +6,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from vergence_proto.geometry import Matrix, Pose, RectifiedRig
+
+RIG = RectifiedRig(8, 6, 10.0, 11.0, 3.5, 3.0, 2.5, 0.1)
+NOT_FINITE = [float("nan"), float("inf"), -float("inf")]
 
 # Whole turns, and turns so small that a careless formula loses them to rounding.
 ANGLES = st.one_of(
