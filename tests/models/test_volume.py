@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
-
 import pytest
 import torch
 
-from vergence_models.layers import all_pairs, banded, conv, joint
-from vergence_models.lite.sharp import FINE_PX, sharp_search
+from vergence_models.layers import all_pairs, conv, joint
 from vergence_models.lite.volume import (
     Volume,
     gathered,
@@ -32,21 +29,6 @@ def test_near_pairs_are_those_of_all_pairs_within_reach(ratio: int, width: int) 
         expected = everything.gather(3, entry.clamp(0, ratio * width - 1)[:, 0, :, :, None])
         difference = gathered(near, entry.float())[:, 0] - expected[..., 0]
         assert difference[inside[:, 0]].abs().max() < 1e-6
-
-
-@pytest.mark.parametrize("width", [32, 56])
-def test_a_sharp_score_is_the_mean_of_those_of_four_cells(width: int) -> None:
-    left, right = torch.randn(2, 4, 6, width), torch.randn(2, 4, 6, 2 * width)
-    sharp = sharp_search(near_pairs(left, right, reach=12, margin=3), 12)
-    cells, scores = banded(all_pairs(left, right), 12), sharp.scores()
-    for x, d in itertools.product(range(width // 2), range(12)):
-        four = cells[:, :, 2 * x : 2 * x + 2, 11 - d].view(2, 3, 2, 2)
-        # What lies outside of the image is no match.
-        expected = four.mean(dim=(2, 3)) if d <= 4 * x else torch.zeros(2, 3)
-        assert torch.allclose(scores[:, :, x, 11 - d], expected, atol=1e-6)
-    assert torch.allclose(sharp.correlation[:, 0], scores.amax(dim=3))
-    winner = 11 - sharp.disparity / FINE_PX
-    assert torch.equal(scores.gather(3, winner[:, 0, :, :, None].long()).squeeze(3), scores.amax(3))
 
 
 def squares(first: float = 0.0) -> Volume:

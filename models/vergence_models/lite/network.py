@@ -32,8 +32,7 @@ from vergence_models.lite.coarse import (
 from vergence_models.lite.context import Context
 from vergence_models.lite.hypotheses import Hypotheses
 from vergence_models.lite.losses import search_cross_entropy
-from vergence_models.lite.refinement import REACH, Refined, Refinement
-from vergence_models.lite.sharp import FINE_PX, SharpSearch, sharp_search
+from vergence_models.lite.refinement import FINE_PX, REACH, Refined, Refinement
 from vergence_models.lite.volume import Volume, near_pairs, whole_rows
 from vergence_models.losses import known, masked_mean, output_loss, robust
 from vergence_models.network import Estimate, State, StereoNetwork
@@ -52,7 +51,6 @@ class Evidence(NamedTuple):
     """What two images say by themselves: made once, whatever the iterations."""
 
     fine: Volume  # at 1/4
-    sharp: SharpSearch
     coarse: Tensor  # [B, H/8, W/8, D]: correlation, largest disparity first
     context4: Tensor  # [B, C, H/4, W/4]
     context8: Tensor
@@ -78,7 +76,6 @@ class LiteEstimate(Estimate):
     """The answer, and the guesses on the way to it."""
 
     coarse_scores: Tensor  # [B, H/8, W/8, D]: unnormalised log-probability, largest disparity first
-    sharp: SharpSearch
     guesses: list[Guess]  # at both scales, of each iteration
 
     def loss(self, truth_px: Tensor, max_disparity_px: int) -> Tensor:
@@ -86,13 +83,8 @@ class LiteEstimate(Estimate):
         loss = output_loss(self.disparity, self.sigma, truth_px, max_disparity_px)
         losses = [guess.loss(truth_px, max_disparity_px) for guess in self.guesses]
         loss = loss + 2 / len(losses) * added(losses)
-        loss = loss + 0.2 * search_cross_entropy(
-            self.coarse_scores, truth_px, max_disparity_px, bin_px=BIN_PX
-        )
-        # A correlation is at most 1: sharpened, it can rule out.
-        return loss + 0.05 * search_cross_entropy(
-            15 * self.sharp.scores(), truth_px, max_disparity_px, bin_px=FINE_PX
-        )
+        search = search_cross_entropy(self.coarse_scores, truth_px, max_disparity_px, bin_px=BIN_PX)
+        return loss + 0.2 * search
 
 
 class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
@@ -129,7 +121,7 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         for _ in range(iterations):
             answer, following, scores = self.iterate(evidence, following, guesses)
         disparity, sigma = self.refinement.enlarged(answer)
-        estimate = LiteEstimate(disparity, sigma, scores, evidence.sharp, guesses)
+        estimate = LiteEstimate(disparity, sigma, scores, guesses)
         return estimate, following
 
     def search(self, left: Tensor, right: Tensor) -> Evidence:
@@ -140,13 +132,12 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         right_fine = self.fine_descriptor(right_half, 1)
         reach = self.config.max_disparity_px // FINE_PX
         fine = near_pairs(left_fine, right_fine, reach=reach, margin=REACH + 2)
-        sharp = sharp_search(fine, reach)
         pairs = all_pairs(
             self.coarse_descriptor(F.avg_pool2d(left_half, 2), 2),
             self.coarse_descriptor(F.avg_pool2d(right_half, 2), 1),
         )
         coarse = banded(pairs, self.config.max_disparity_px // BIN_PX)
-        return Evidence(fine, sharp, coarse, *self.context(left_rows))
+        return Evidence(fine, coarse, *self.context(left_rows))
 
     def iterate(
         self, evidence: Evidence, state: LiteState, guesses: list[Guess]
@@ -175,7 +166,7 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
             scores=scores,
             context=evidence.context8,
         )
-        answer = self.refinement(evidence.fine, d, evidence.sharp, hidden, prior, evidence.context4)
+        answer = self.refinement(evidence.fine, d, hidden, prior, evidence.context4)
         guesses.append(Guess(d, hypotheses, 8))
         guesses.append(Guess(answer.disparity, answer.hypotheses, 4))
         return answer, LiteState(answer.disparity, hidden), scores.scores

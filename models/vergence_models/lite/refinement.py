@@ -21,13 +21,18 @@ from vergence_models.layers import (
 )
 from vergence_models.lite.coarse import MIN_PX, beyond
 from vergence_models.lite.hypotheses import Hypotheses
-from vergence_models.lite.sharp import FINE_PX, SharpSearch, rims
 from vergence_models.lite.volume import Volume, lookup, lookup_row
 from vergence_models.warp import cell_centres
 
-SURFACES = 7  # hypotheses of a cell
+SURFACES = 6  # hypotheses of a cell
+FINE_PX = 2  # spacing of the fine descriptors along the right row, and so of the disparities
 REACH = 2  # entries looked up on either side of the current disparity
 TAPS = 2 * REACH + 1
+
+
+def rims(d: Tensor) -> Tensor:
+    """The largest and the smallest disparity of 3x3 cells: [B, 1, H, W] to [B, 2, H, W]."""
+    return torch.cat((F.max_pool2d(d, 3, 1, 1), -F.max_pool2d(-d, 3, 1, 1)), dim=1)
 
 
 class Refined(NamedTuple):
@@ -46,15 +51,14 @@ class Refinement(nn.Module):
         super().__init__()
         width = config.fine_channels
         self.hidden = conv(config.hidden, 16, kernel=1)
-        self.first = conv(config.context_quarter + 16 + 4 * SURFACES + 1, width, kernel=1)
+        self.first = conv(config.context_quarter + 16 + 4 * SURFACES, width, kernel=1)
         self.down = conv(width, config.fine_low, stride=2)
         self.low = conv(config.fine_low, config.fine_low)
         self.lower = conv(config.fine_low, config.fine_low)
         self.back = silent(conv(config.fine_low, width, kernel=1))
+        self.deeper = conv(width, width)
+        self.deepest = silent(conv(width, width))
         self.choose = silent(conv(width, SURFACES))
-        # Of a hundred correlations the best is high by chance: it has to earn its choice.
-        with torch.no_grad():
-            self.choose.bias[4:] = -1  # type: ignore[index]  # conv has a bias
         self.second = conv(width + 2 * TAPS + 6, width)
         self.out = silent(conv(width, 3, kernel=1))
         self.upsample = ConvexUpsampler(width)
@@ -65,12 +69,15 @@ class Refinement(nn.Module):
         self,
         pairs: Volume,
         d_eighth: Tensor,
-        sharp: SharpSearch,
         hidden: Tensor,
         prior: Tensor,
         context: Tensor,
     ) -> Refined:
-        """Choose and fit; hypotheses are those of 1/8, of the sharp search, and the prior px."""
+        """Choose and fit. Hypotheses are the surface of 1/8, the prior, and the rims of both.
+
+        Volume of :func:`near_pairs` at 1/4; px at 1/8 and, 0 where unknown, at 1/4; hidden state at
+        1/8, context at 1/4.
+        """
         u, _ = cell_centres(prior.shape[2], prior.shape[3], 4, prior)
         column = (u - 1.5) * (1 / FINE_PX)
 
@@ -80,17 +87,17 @@ class Refinement(nn.Module):
         plain = F.interpolate(d_eighth, scale_factor=2.0, mode="bilinear")
         hole = (prior <= 0).to(prior.dtype)
         carried = prior + hole * plain
-        around = enlarge(torch.cat((rims(d_eighth), sharp.disparity, rims(sharp.disparity)), dim=1))
-        surfaces = torch.cat((plain, around[:, :2], carried, around[:, 2:]), dim=1)
+        surfaces = torch.cat((plain, enlarge(rims(d_eighth)), carried, rims(carried)), dim=1)
         cost = lookup(pairs, position(surfaces))
         wide = box3(cost)
         apart = squash(surfaces[:, 1:] - plain, 2.0)
         up = enlarge(self.hidden(hidden))
-        told = (enlarge(sharp.correlation), cost, wide, apart, hole, beyond(surfaces, scale=4))
-        x = F.relu(joint(self.first, context, up, torch.cat(told, dim=1)))
+        told = torch.cat((cost, wide, apart, hole, beyond(surfaces, scale=4)), dim=1)
+        x = F.relu(joint(self.first, context, up, told))
         # Where an object ends shows in a wider view than 3x3 cells.
         low = F.relu6(self.lower(F.relu6(self.low(F.relu6(self.down(x))))))
         x = F.relu(x + enlarge(self.back(low)))
+        x = F.relu(x + self.deepest(F.relu(self.deeper(x))))
         fixed = cost * self.sharpness[0] + wide * self.sharpness[1]
         hypotheses = Hypotheses(surfaces, fixed + 4 * self.choose(x))
         d = hypotheses.mean()
