@@ -12,24 +12,21 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-BLOCK = 20  # columns that share a window; even, for the cells of 1/8
+BLOCKS = 8  # of columns: images are as wide as multiples of 32, so cells of 1/4 divide into them
 
 
 class Volume(NamedTuple):
     """For each cell the scores of a window of its row: entries ``first`` to ``first + N - 1``."""
 
-    scores: Tensor  # [..., N], the cells in any order
-    begin: Tensor  # [B, 1, H, W] int64: where a cell's window is in the flattened scores
+    scores: Tensor  # [B, H, W, N]
     first: Tensor  # [W], float
     last: int  # the row's last entry; outside of 0 .. last every score is 0
 
 
 def whole_rows(scores: Tensor) -> Volume:
     """A volume whose windows are all of the row, ``scores`` [B, H, W, N]."""
-    batch, height, width, window = scores.shape
-    begin = torch.arange(batch * height * width, device=scores.device) * window
-    first = torch.zeros(width, dtype=scores.dtype, device=scores.device)
-    return Volume(scores, begin.view(batch, 1, height, width), first, window - 1)
+    first = torch.zeros(scores.shape[2], dtype=scores.dtype, device=scores.device)
+    return Volume(scores, first, scores.shape[3] - 1)
 
 
 def near_pairs(left: Tensor, right: Tensor, *, reach: int, margin: int) -> Volume:
@@ -37,32 +34,24 @@ def near_pairs(left: Tensor, right: Tensor, *, reach: int, margin: int) -> Volum
 
     The left cell x meets the right entries from r x - reach - margin to r x + margin, some more at
     either end: a block of columns shares its window. What lies outside of the row is not masked.
-    H is even: the scores are [B H/2, blocks, 2, BLOCK, N], two rows of a block side by side.
     """
     batch, channels, height, width = left.shape
     ratio = right.shape[3] // width
-    blocks = (width + BLOCK - 1) // BLOCK
-    window = ratio * BLOCK + reach + 2 * margin
-
-    def in_blocks(descriptors: Tensor, start: Tensor, count: int) -> Tensor:
-        """Of each block ``count`` entries of both rows from ``start`` on: [.., 2, count, C]."""
-        entries = descriptors.shape[3]
-        index = (start[:, None] + torch.arange(count, device=start.device)).clamp(0, entries - 1)
-        index = index[:, None] + torch.tensor([[0], [1]], device=start.device) * entries
-        # With its channels side by side a descriptor is copied at once.
-        rows = descriptors.permute(0, 2, 3, 1).reshape(-1, 2 * entries, channels)
-        return rows.index_select(1, index.flatten()).view(-1, blocks, 2, count, channels)
-
-    block = torch.arange(blocks, device=left.device)
-    start = block * (ratio * BLOCK) - (reach + margin)
-    left_rows, right_rows = in_blocks(left, block * BLOCK, BLOCK), in_blocks(right, start, window)
-    scores = torch.matmul(left_rows, right_rows.transpose(3, 4)) * (1 / channels)
-    x = torch.arange(width, device=left.device)
-    y = torch.arange(batch * height, device=left.device)[:, None]
-    begin = ((y // 2 * blocks + x // BLOCK) * 2 + y % 2) * BLOCK + x % BLOCK
-    first = start.to(left.dtype).index_select(0, x // BLOCK)
-    begin = begin.view(batch, 1, height, width) * window
-    return Volume(scores, begin, first, ratio * width - 1)
+    block = width // BLOCKS
+    window = ratio * block + reach + 2 * margin
+    start = torch.arange(BLOCKS, device=left.device) * (ratio * block) - (reach + margin)
+    entries = start[:, None] + torch.arange(window, device=left.device)
+    entries = entries.clamp(0, ratio * width - 1).flatten()
+    # With its channels side by side a descriptor is copied at once.
+    left_rows = left.permute(0, 2, 3, 1)
+    right_rows = right.permute(0, 2, 3, 1).index_select(2, entries)
+    scores = torch.matmul(
+        left_rows.reshape(batch, height, BLOCKS, block, channels),
+        right_rows.view(batch, height, BLOCKS, window, channels).transpose(3, 4),
+    )
+    scores = scores * (1 / channels)  # of a product, onnxruntime does that on the way
+    first = start[:, None].expand(-1, block).reshape(width).to(left.dtype)
+    return Volume(scores.view(batch, height, width, window), first, ratio * width - 1)
 
 
 def lookup(volume: Volume, position: Tensor) -> Tensor:
@@ -95,10 +84,12 @@ def lookup_row(volume: Volume, position: Tensor, reach: int) -> Tensor:
 
 def gathered(volume: Volume, entry: Tensor) -> Tensor:
     """The scores at whole entries [B, K, H, W], float; the nearest in the window if it has none."""
-    window = volume.scores.shape[-1]
-    index = (entry - volume.first).clamp(0, window - 1).long() + volume.begin
+    batch, height, width, window = volume.scores.shape
+    cells = torch.arange(batch * height * width, device=entry.device)
+    begin = (cells * window).view(batch, 1, height, width)
+    index = (entry - volume.first).clamp(0, window - 1).long() + begin
     # Row by row, so that a row is still in the cache when its next entry is read.
     by_row = index.transpose(1, 2)
-    # One entry each: onnxruntime's gather of elements is four times as quick as that of slices.
+    # Of single entries onnxruntime's gather of elements is four times as quick as that of slices.
     found = volume.scores.flatten().gather(0, by_row.flatten())
     return found.view(by_row.shape).transpose(1, 2)
