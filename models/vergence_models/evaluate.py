@@ -57,11 +57,10 @@ def methods_for(network: SteppedNetwork, *, thorough: bool) -> list[Method]:
     return methods + sgbm_methods()
 
 
-def footage_on_disk(data: list[str]) -> Iterator[Footage]:
-    """Every source under each KIND:PATH. Raises LayoutError."""
-    for spec in data:
-        for source in find_sources(spec):
-            yield footage_from_source(open_source(source))
+def footage_on_disk(sources: list[str]) -> Iterator[Footage]:
+    """Each source, as ``find_sources`` lists them. Raises LayoutError."""
+    for source in sources:
+        yield footage_from_source(open_source(source))
 
 
 def footage_of_pool(folder: Path, clips: int) -> Iterator[Footage]:
@@ -72,9 +71,9 @@ def footage_of_pool(folder: Path, clips: int) -> Iterator[Footage]:
         yield footage_from_clip(clip, 0, f"{folder.name}/{index}")
 
 
-def gather(data: list[str], pool: list[Path], clips: int) -> Iterator[tuple[str, Footage]]:
+def gather(sources: list[str], pool: list[Path], clips: int) -> Iterator[tuple[str, Footage]]:
     """(group, footage): each source on disk is a group of its own, the clips of a pool are one."""
-    for footage in footage_on_disk(data):
+    for footage in footage_on_disk(sources):
         yield footage.name, footage
     for folder in pool:
         for footage in footage_of_pool(folder, clips):
@@ -181,10 +180,12 @@ def main(arguments: list[str] | None = None) -> None:
     if given.json:
         given.json.parent.mkdir(parents=True, exist_ok=True)
     try:
+        # Before the graphs are loaded, which takes seconds.
+        sources = [source for spec in given.data for source in find_sources(spec)]
         network = OnnxNetwork(given.weights, given.model, threads=given.threads)
         results = evaluate(
             methods_for(network, thorough=given.thorough),
-            gather(given.data, given.pool, given.clips),
+            gather(sources, given.pool, given.clips),
         )
     except (ManifestError, LayoutError, FileNotFoundError) as error:
         sys.exit(f"vergence_models.evaluate: {error}")

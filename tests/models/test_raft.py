@@ -5,14 +5,17 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
+import numpy as np
 import onnx
+import onnxruntime
 import pytest
 import torch
 
 from vergence_models.config import Config, RaftNetworkConfig
 from vergence_models.export import PARITY_PX, check_parity, export_run, shifted_pair
-from vergence_models.graphs import folded
+from vergence_models.graphs import export_part, folded
 from vergence_models.raft.network import RaftNetwork, RaftState
+from vergence_models.raft.parts import parts_of
 from vergence_models.raft.update import looked_up, pyramid
 from vergence_models.runs import Run
 from vergence_proto.model_io import ManifestError, load_model_card
@@ -39,15 +42,25 @@ def tiny_network(*, warp: bool = True) -> RaftNetwork:
                 parameter.normal_(0, 0.02)
         for module in network.modules():
             if isinstance(module, torch.nn.BatchNorm2d):
-                for statistic in (module.running_mean, module.running_var):
-                    assert statistic is not None
-                    statistic.uniform_(0.5, 1.5)
+                assert module.running_mean is not None
+                assert module.running_var is not None
+                module.running_mean.uniform_(-0.3, 0.3)
+                module.running_var.uniform_(0.5, 1.5)
     return network.eval()
 
 
 def views(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
     left, right = shifted_pair(HEIGHT, WIDTH, seed)
     return torch.from_numpy(left), torch.from_numpy(right)
+
+
+def test_the_images_reach_the_answer() -> None:
+    """Or all that is compared below would be constants."""
+    network = tiny_network()
+    still, state = torch.eye(4)[None], network.cold_state(1, HEIGHT, WIDTH)
+    with torch.inference_mode():
+        one, other = (network(*views(seed), still, state, 2)[0].disparity for seed in (1, 2))
+    assert (one - other).abs().mean() > 0.1
 
 
 @pytest.fixture
@@ -57,15 +70,14 @@ def quiet(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("quiet")
-@pytest.mark.parametrize("tier", ["full", "fast"])
-def test_exported_graphs_equal_pytorch_and_share_their_weights(tier: str, tmp_path: Path) -> None:
-    network = tiny_network(warp=tier == "full")
-    run = Run(tier, network.config, network.state_dict(), story={}, measured={})
-    export_run(run, Config(tier, network.config, iterations=(1, 3)), tmp_path)
+def test_exported_graphs_equal_pytorch_and_share_their_weights(tmp_path: Path) -> None:
+    network = tiny_network()
+    run = Run("full", network.config, network.state_dict(), story={}, measured={})
+    export_run(run, Config("full", network.config, iterations=(1, 3)), tmp_path)
 
-    card = load_model_card(tmp_path, tier)
+    card = load_model_card(tmp_path, "full")
     assert card.state == network.state_tensors
-    weights = tmp_path / f"{tier}.weights"
+    weights = tmp_path / "full.weights"
     for count, path in card.graphs.items():
         assert check_parity(network, count, path, frames=4) < PARITY_PX
         kinds = {node.op_type for node in onnx.load(path, load_external_data=False).graph.node}
@@ -76,8 +88,35 @@ def test_exported_graphs_equal_pytorch_and_share_their_weights(tier: str, tmp_pa
     content = bytearray(weights.read_bytes())
     content[len(content) // 2] ^= 1
     weights.write_bytes(content)
-    with pytest.raises(ManifestError, match=rf"{tier}.weights: expected sha256"):
-        load_model_card(tmp_path, tier)
+    with pytest.raises(ManifestError, match=r"full.weights: expected sha256"):
+        load_model_card(tmp_path, "full")
+
+
+@pytest.mark.usefixtures("quiet")
+def test_the_exported_beginning_without_a_warp_equals_pytorch(tmp_path: Path) -> None:
+    """Of `fast`. What follows it is the code of `full`, to the last operation."""
+    network = folded(tiny_network(warp=False))
+    begin, path = parts_of(network).begin, tmp_path / "begin.onnx"
+    export_part(begin, path)
+    moved = torch.eye(4).repeat(2, 1, 1)
+    moved[1, 0, 3] = 9.0
+    (left, right), (other_left, other_right) = views(1), views(2)
+    inputs = (
+        torch.cat((left, other_left)),
+        torch.cat((right, other_right)),
+        moved,
+        torch.rand(2, 1, HEIGHT // 8, WIDTH // 8) * 30,
+        torch.randn(2, 16, HEIGHT // 8, WIDTH // 8),
+        torch.randn(2, 16, HEIGHT // 16, WIDTH // 16),
+    )
+    with torch.inference_mode():
+        expected = begin.module(*inputs)
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    feeds = dict(zip(begin.input_names, (tensor.numpy() for tensor in inputs), strict=True))
+    found = session.run(begin.output_names, feeds)
+    for got, tensor in zip(found, expected, strict=True):
+        # They sum in different orders.
+        np.testing.assert_allclose(got, tensor.numpy(), atol=1e-3)
 
 
 def test_folding_batch_norms_changes_no_result() -> None:

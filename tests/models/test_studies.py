@@ -22,7 +22,7 @@ from vergence_models.methods import (
     with_pose_noise,
     without_poses,
 )
-from vergence_models.stepping import Footage, OnnxNetwork, footage_from_clip
+from vergence_models.stepping import Footage, SteppedNetwork, footage_from_clip
 from vergence_models.studies.__main__ import main
 from vergence_models.studies.bench import Bench
 from vergence_models.studies.contenders import (
@@ -52,13 +52,13 @@ def wall() -> Footage:
 
 
 @pytest.fixture(scope="module")
-def network() -> OnnxNetwork:
-    return OnnxNetwork(WEIGHTS, "lite", threads=1)
+def contenders() -> list[Contender]:
+    return gather_contenders([WEIGHTS], [], threads=1)
 
 
 @pytest.fixture(scope="module")
-def contenders() -> list[Contender]:
-    return gather_contenders([WEIGHTS], [], threads=1)
+def network(contenders: list[Contender]) -> SteppedNetwork:
+    return contenders[0].network
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +122,7 @@ def test_noise_of_level_zero_is_the_true_motion(tables: dict[str, Table]) -> Non
 
 
 def test_a_single_frame_row_sees_each_frame_for_the_first_time(
-    network: OnnxNetwork, wall: Footage
+    network: SteppedNetwork, wall: Footage
 ) -> None:
     together = list(single_frame_method(network, "lite", 2).predict(wall))
     for view, expected in zip(wall.views, together, strict=True):
@@ -132,7 +132,7 @@ def test_a_single_frame_row_sees_each_frame_for_the_first_time(
 
 
 def test_a_state_that_is_not_moved_is_that_of_a_camera_that_stands_still(
-    network: OnnxNetwork, wall: Footage
+    network: SteppedNetwork, wall: Footage
 ) -> None:
     warm = warm_method(network, "lite", 1, cold=1)
     still = replace(
@@ -178,7 +178,9 @@ def test_the_same_seed_gives_the_same_tables(
     assert warp_ablation(again) == tables["warp"]
 
 
-def test_a_run_adds_only_the_counts_that_no_graph_has(network: OnnxNetwork, wall: Footage) -> None:
+def test_a_run_adds_only_the_counts_that_no_graph_has(
+    network: SteppedNetwork, wall: Footage
+) -> None:
     graphs, run = gather_contenders([WEIGHTS], [RUN], threads=1)
     assert not set(graphs.warm) & set(run.warm)
     assert not set(graphs.single_frame) & set(run.single_frame)
@@ -208,19 +210,8 @@ def test_the_command_writes_what_it_ran_and_keeps_the_rest(
     path = tmp_path / "out" / "studies.json"
     path.parent.mkdir()
     write_tables(path, [tables["main"], tables["speed"]])
-    main(
-        [
-            "--json",
-            str(path),
-            "--studies",
-            "times",
-            "--quick",
-            "--cache",
-            str(cache),
-            "--threads",
-            "1",
-        ]
-    )
+    options = ["--studies", "times", "--quick", "--threads", "1", "--cache", str(tmp_path)]
+    main(["--json", str(path), *options])
     kept = read_tables(path)
     assert set(kept) == {"main", "speed", "times"}
     assert kept["times"].labels == kept["main"].labels

@@ -15,6 +15,7 @@ from vergence_models.data.pool import render_pool
 from vergence_models.data.shots import Mix, Playback
 from vergence_models.evaluate import footage_of_pool, footage_on_disk
 from vergence_models.stepping import Footage
+from vergence_proto.layouts import find_sources
 
 SEED = 910_001  # training and validation pools have others
 SPEEDS = (1, 2, 6, 10, 20)
@@ -103,4 +104,4 @@ def rendered(
 def group_on_disk(spec: str, frames: int) -> Group:
     """Every source under KIND:PATH. Raises LayoutError as it is read."""
     words = f"at most {frames} frames of each sequence in `{spec}`"
-    return Group(spec, words, frames, lambda: footage_on_disk([spec]))
+    return Group(spec, words, frames, lambda: footage_on_disk(find_sources(spec)))
