@@ -61,8 +61,9 @@ class CostFilter(nn.Module):
         claim = (fixed - best_rival(fixed, 2)).clamp(max=0) * 0.1
         bin_px = torch.arange(bins - 1, -1, -1, device=volume.device).to(volume.dtype) * BIN_PX
         bin_px = bin_px[None, :, None, None]
-        near = 1 - (prior - bin_px).abs() * (1 / (2 * BIN_PX))
-        near = near.clamp(min=0) * (prior > 0).to(volume.dtype)
+        # Where nothing is expected, nothing is near.
+        expected_px = prior - (prior <= 0).to(volume.dtype) * 1e3
+        near = (1 - (expected_px * (0.5 / BIN_PX) - bin_px * (0.5 / BIN_PX)).abs()).clamp(min=0)
         u, _ = cell_centres(height, width, 8, volume)
         in_view = (bin_px <= u).to(volume.dtype).expand_as(narrow)
         sides = F.pad(middle, (0, 0, 0, 0, 1, 1))

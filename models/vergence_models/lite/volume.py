@@ -85,11 +85,10 @@ def lookup_row(volume: Volume, position: Tensor, reach: int) -> Tensor:
 def gathered(volume: Volume, entry: Tensor) -> Tensor:
     """The scores at whole entries [B, K, H, W], float; the nearest in the window if it has none."""
     batch, height, width, window = volume.scores.shape
-    cells = torch.arange(batch * height * width, device=entry.device)
-    begin = (cells * window).view(batch, 1, height, width)
-    index = (entry - volume.first).clamp(0, window - 1).long() + begin
+    begin = torch.arange(width, device=entry.device).to(entry.dtype) * window
     # Row by row, so that a row is still in the cache when its next entry is read.
-    by_row = index.transpose(1, 2)
+    by_row = (entry.transpose(1, 2) - volume.first).clamp(0, window - 1) + begin
     # Of single entries onnxruntime's gather of elements is four times as quick as that of slices.
-    found = volume.scores.flatten().gather(0, by_row.flatten())
+    rows = volume.scores.reshape(batch * height, width * window)
+    found = rows.gather(1, by_row.long().reshape(batch * height, -1))
     return found.view(by_row.shape).transpose(1, 2)
