@@ -11,6 +11,7 @@ import onnxruntime
 import pytest
 import torch
 
+from tests.models.trained import as_trained
 from vergence_models.config import Config, RaftNetworkConfig
 from vergence_models.export import PARITY_PX, check_parity, export_run, shifted_pair
 from vergence_models.graphs import export_part, folded
@@ -33,20 +34,8 @@ TINY = {
 
 
 def tiny_network(*, warp: bool = True) -> RaftNetwork:
-    """As training might have left it: no weight of a head is zero, no norm is the identity."""
     torch.manual_seed(5)
-    network = RaftNetwork(RaftNetworkConfig(warp=warp, **TINY))
-    with torch.no_grad():
-        for parameter in network.parameters():
-            if parameter.dim() == 4 and not parameter.any():
-                parameter.normal_(0, 0.02)
-        for module in network.modules():
-            if isinstance(module, torch.nn.BatchNorm2d):
-                assert module.running_mean is not None
-                assert module.running_var is not None
-                module.running_mean.uniform_(-0.3, 0.3)
-                module.running_var.uniform_(0.5, 1.5)
-    return network.eval()
+    return as_trained(RaftNetwork(RaftNetworkConfig(warp=warp, **TINY)))
 
 
 def views(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
