@@ -103,6 +103,14 @@ def plan(model: ModelProto) -> Plan:
             give_bytes(result)
         elif node.op_type in LAYOUT_OPS and node.input[0] in source:
             source[result] = source[node.input[0]]
+    # What is put together for a convolution alone is put together as bytes.
+    made_by = {name: node for node in model.graph.node for name in node.output}
+    for node in reversed(model.graph.node):
+        whole, result = node.input[0] if node.input else "", node.output[0]
+        if node.op_type not in LAYOUT_OPS or result not in source or len(readers[whole]) > 1:
+            continue
+        if whole in made_by and made_by[whole].op_type == "Concat":
+            source.setdefault(whole, source[result])
     return Plan(frozenset(convolutions), source, absorbed)
 
 
@@ -134,18 +142,12 @@ class _Writer:
         self._asked: dict[str, int] = {}  # result of a widened convolution -> channels asked for
 
     def send_as_bytes(self, name: str) -> None:
-        """If the plan says so."""
-        if name not in self._scales:
+        """If the plan says so, and they are not yet."""
+        if name not in self._scales or name in self._reading:
             return
-        scale = self._scales[name]
-        by = [
-            self._constant(f"{name}.step", scale.step),
-            self._constant(f"{name}.zero", scale.zero),
-        ]
         real = self._plan.absorbed.get(name, name)
-        self._add("QuantizeLinear", [real, *by], f"{name}.bytes")
         # The contract's outputs keep their name, and what they were before the bytes.
-        reading = self._add("DequantizeLinear", [f"{name}.bytes", *by], f"{name}.real")
+        reading = self._through_bytes(real, name, name)
         if real in self._asked:
             ends = {"start": [0], "end": [self._asked[real]], "axis": [1]}
             cut = [self._constant(f"{name}.{end}", np.array(ends[end], np.int64)) for end in ends]
@@ -155,8 +157,19 @@ class _Writer:
     def copy(self, node: NodeProto) -> None:
         copied = NodeProto.FromString(node.SerializeToString())
         inputs = [self._reading.get(name, name) for name in node.input]
-        if node.output[0] in self._plan.convolutions:
+        result = node.output[0]
+        if result in self._plan.convolutions:
             inputs[1:] = self._weights(node)
+        elif node.op_type == "Concat" and result in self._scales:
+            inputs = [
+                each
+                if name in self._scales
+                else self._through_bytes(each, f"{result}.{at}", result)
+                for at, (name, each) in enumerate(zip(node.input, inputs, strict=True))
+            ]
+        elif node.op_type == "Resize" and node.input[0] in self._scales and self._doubles(node):
+            self._add_doubled(node.input[0], result)
+            return
         del copied.input[:]
         copied.input.extend(inputs)
         self._nodes.append(copied)
@@ -169,6 +182,49 @@ class _Writer:
         model.graph.node.extend(self._nodes)
         model.graph.initializer.extend([*kept, *self._new.values()])
         return model
+
+    def _through_bytes(self, real: str, name: str, like: str) -> str:
+        """``real`` as bytes of the scale of ``like``, and what is real again of that."""
+        by = self._scale(like)
+        self._add("QuantizeLinear", [real, *by], f"{name}.bytes")
+        return self._add("DequantizeLinear", [f"{name}.bytes", *by], f"{name}.real")
+
+    def _scale(self, name: str) -> list[str]:
+        scale = self._scales[name]
+        return [
+            self._constant(f"{name}.step", scale.step),
+            self._constant(f"{name}.zero", scale.zero),
+        ]
+
+    def _doubles(self, node: NodeProto) -> bool:
+        """Whether each cell becomes four."""
+        how = {entry.name: entry.s for entry in node.attribute}
+        scales = self._old.get(node.input[2]) if len(node.input) == 3 else None
+        return (
+            scales is not None
+            and numpy_helper.to_array(scales).tolist() == [1, 1, 2, 2]
+            and how.get("mode") == b"nearest"
+            and how.get("nearest_mode") == b"floor"
+            and how.get("coordinate_transformation_mode") == b"asymmetric"
+            and node.input[0] not in self._asked
+        )
+
+    def _add_doubled(self, name: str, result: str) -> None:
+        """Twice the size by copies of bytes, channels last: first of columns, then of rows."""
+        twice = self._constant("twice", np.array([1, 2, 2, 1], np.int64))
+        rows = self._constant("rows", np.array([0, 0, -1], np.int64))
+        cells = self._add("Transpose", [f"{name}.bytes"], f"{result}.cells", perm=[0, 2, 3, 1])
+        shape = self._add("Shape", [cells], f"{result}.half")
+        shape = self._add("Mul", [shape, twice], f"{result}.shape")
+        wide = self._add("Concat", [cells, cells], f"{result}.pairs", axis=3)
+        wide = self._add("Reshape", [wide, rows], f"{result}.rows")
+        high = self._add("Concat", [wide, wide], f"{result}.blocks", axis=2)
+        high = self._add("Reshape", [high, shape], f"{result}.last")
+        self._add("Transpose", [high], f"{result}.bytes", perm=[0, 3, 1, 2])
+        by = self._scale(result)
+        self._reading[result] = self._add(
+            "DequantizeLinear", [f"{result}.bytes", *by], f"{result}.real"
+        )
 
     def _weights(self, node: NodeProto) -> list[str]:
         """Weight and bias of a convolution as int8 and int32."""
@@ -202,7 +258,9 @@ class _Writer:
         self._new[name] = numpy_helper.from_array(np.asarray(value), name)
         return name
 
-    def _add(self, operator: str, inputs: list[str], output: str, **attributes: int) -> str:
+    def _add(
+        self, operator: str, inputs: list[str], output: str, **attributes: int | list[int]
+    ) -> str:
         node = helper.make_node(operator, inputs, [output])
         node.attribute.extend(helper.make_attribute(*each) for each in attributes.items())
         self._nodes.append(node)

@@ -143,6 +143,49 @@ def test_convolutions_of_features_become_bytes_and_images_stay() -> None:
     assert Counter(node.op_type for node in graph.node)["Relu"] == 1
 
 
+def with_a_wider_view(model: ModelProto) -> ModelProto:
+    """The same, but the answer also hears a little of features at half size, and of the image."""
+    nodes = model.graph.node
+    (place,) = (k for k, node in enumerate(nodes) if node.output[0] == "next_disparity")
+    (whole,) = (tensor for tensor in model.graph.initializer if tensor.name == "answer.weight")
+    random = np.random.default_rng(1)
+    half = random.normal(0, 0.1, (16, 16, 3, 3)).astype(np.float32)
+    more = random.normal(0, 0.002, (1, 24, 3, 3)).astype(np.float32)
+    answer = np.concatenate((numpy_helper.to_array(whole), more), axis=1)
+    model.graph.initializer.remove(whole)
+    two = np.array([1, 1, 2, 2], np.float32)
+    constants = {"half.weight": half, "answer.weight": answer, "two": two}
+    model.graph.initializer.extend(
+        numpy_helper.from_array(value, name) for name, value in constants.items()
+    )
+    how = {"nearest_mode": "floor", "coordinate_transformation_mode": "asymmetric"}
+    wider = [
+        helper.make_node(
+            "Conv", ["both_positive", "half.weight"], ["half"], strides=[2, 2], pads=[1, 1, 1, 1]
+        ),
+        helper.make_node("Resize", ["half", "", "two"], ["twice"], mode="nearest", **how),
+        helper.make_node("Concat", ["both_positive", "twice", "patches"], ["joined"], axis=1),
+    ]
+    nodes[place].input[0] = "joined"
+    for node in reversed(wider):
+        nodes.insert(place, node)
+    onnx.checker.check_model(model)
+    return model
+
+
+def test_bytes_are_put_together_and_doubled_as_they_are() -> None:
+    model = with_a_wider_view(wall_model())
+    what = plan(model)
+    scales = find_scales(model, what.measured, STATES, wall_clips(2))
+    int8 = quantized(model, what, scales)
+    step = float(scales["next_disparity"].step)
+    np.testing.assert_allclose(answer_of(int8), answer_of(model), atol=3 * step)
+    made_by = {name: node for node in int8.graph.node for name in node.output}
+    resized = {node.output[0] for node in int8.graph.node if node.op_type == "Resize"}
+    assert resized == {"large"}  # four times the size is left as it was, twice is copies
+    assert {made_by[name].op_type for name in made_by["joined"].input} == {"DequantizeLinear"}
+
+
 def test_split_weights_become_constants_of_their_own() -> None:
     model = wall_model()
     (place,) = (k for k, node in enumerate(model.graph.node) if node.output[0] == "a")
