@@ -38,19 +38,18 @@ def near_pairs(left: Tensor, right: Tensor, *, reach: int, margin: int) -> Volum
     batch, channels, height, width = left.shape
     ratio = right.shape[3] // width
     block = width // BLOCKS
-    window = ratio * block + reach + 2 * margin
-    start = torch.arange(BLOCKS, device=left.device) * (ratio * block) - (reach + margin)
-    entries = start[:, None] + torch.arange(window, device=left.device)
-    entries = entries.clamp(0, ratio * width - 1).flatten()
-    # With its channels side by side a descriptor is copied at once.
-    left_rows = left.permute(0, 2, 3, 1)
-    right_rows = right.permute(0, 2, 3, 1).index_select(2, entries)
-    scores = torch.matmul(
-        left_rows.reshape(batch, height, BLOCKS, block, channels),
-        right_rows.view(batch, height, BLOCKS, window, channels).transpose(3, 4),
-    )
-    scores = scores * (1 / channels)  # of a product, onnxruntime does that on the way
-    first = start[:, None].expand(-1, block).reshape(width).to(left.dtype)
+    # In cells, as wide as left ones, whose entries are copied at once with all their channels.
+    before, after = -(-(reach + margin) // ratio), -(-margin // ratio)
+    start = torch.arange(BLOCKS, device=left.device) * block - before
+    cells = torch.arange(before + block + after, device=left.device) + start[:, None]
+    left_rows = left.permute(0, 2, 3, 1).reshape(batch, height, BLOCKS, block, channels)
+    right_rows = right.permute(0, 2, 3, 1).reshape(batch, height, width, ratio * channels)
+    right_rows = right_rows.index_select(2, cells.clamp(0, width - 1).flatten())
+    window = ratio * (before + block + after)
+    right_rows = right_rows.view(batch, height, BLOCKS, window, channels)
+    # Of a product, onnxruntime does the division on the way.
+    scores = torch.matmul(left_rows, right_rows.transpose(3, 4)) * (1 / channels)
+    first = (ratio * start)[:, None].expand(-1, block).reshape(width).to(left.dtype)
     return Volume(scores.view(batch, height, width, window), first, ratio * width - 1)
 
 
