@@ -103,6 +103,8 @@ async def run_to_the_middle(folder: Path, job: Job) -> None:
     model, progress = StopsAfter(FRAMES // 2), Progress()
     async with running_server(model) as server:
         work = asyncio.create_task(run_job(server.engine, folder, job, progress, checkpoint_s=1e-9))
+        # Not before the model has stopped: nobody would let it go.
+        await eventually(lambda: len(model.batches) > FRAMES // 2)
         # Of those that were stepped, two are in the queue of answers and two in that of writes.
         await eventually(lambda: progress.frames_done >= FRAMES // 2 - 4)
         work.cancel()
