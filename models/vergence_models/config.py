@@ -90,7 +90,7 @@ class Config:
     name: str
     network: NetworkConfig
     training: TrainingConfig = field(default_factory=TrainingConfig)
-    iterations: tuple[int, ...] = (1, 2, 4)  # graphs to export
+    iterations: tuple[int, ...] = (1, 2, 4, 8)  # graphs to export
 
 
 # Windows of a sharper camera need less blowing up; a stereo pair alone has to be good too.
