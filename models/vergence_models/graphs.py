@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import warnings
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -104,9 +105,35 @@ def export_part(part: Part, path: Path) -> None:
     slim(path)
 
 
+def join_clamps(model: onnx.ModelProto) -> None:
+    """Make one operator of a clamp to a size, which the exporter writes as a Max and a Min."""
+    graph = model.graph
+    scalars = {tensor.name for tensor in graph.initializer if not tensor.dims}
+    scalars |= {value.name for value in graph.value_info if is_scalar(value)}
+    uses = Counter(name for node in graph.node for name in node.input)
+    uses.update(output.name for output in graph.output)
+    raised = {
+        node.output[0]: node
+        for node in graph.node
+        if node.op_type == "Max" and len(node.input) == 2 and node.input[1] in scalars
+    }
+    for node in [node for node in graph.node if node.op_type == "Min" and len(node.input) == 2]:
+        value, high = node.input
+        if value in raised and uses[value] == 1 and high in scalars:
+            node.op_type = "Clip"
+            del node.input[:]
+            node.input.extend([*raised[value].input, high])
+            graph.node.remove(raised[value])
+
+
+def is_scalar(value: onnx.ValueInfoProto) -> bool:
+    return value.type.tensor_type.HasField("shape") and not value.type.tensor_type.shape.dim
+
+
 def slim(path: Path) -> None:
     """Drop what the exporter notes about the author's machine (stack traces, file paths)."""
     model = onnx.load(path)
+    join_clamps(model)
     for node in model.graph.node:
         del node.metadata_props[:]
     del model.graph.value_info[:]

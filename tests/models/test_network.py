@@ -7,15 +7,18 @@ import logging
 from pathlib import Path
 
 import numpy as np
+import onnx
+import onnxruntime
 import pytest
 import torch
 from numpy.typing import NDArray
+from torch import nn
 
 from tests.models.trained import as_trained
 from vergence_models.config import LiteNetworkConfig
 from vergence_models.evaluate import WEIGHTS
 from vergence_models.export import PARITY_PX, check_parity, shifted_pair
-from vergence_models.graphs import export_part, whole_step
+from vergence_models.graphs import COLUMNS, Part, export_part, whole_step
 from vergence_models.layers import all_pairs, banded, best_rival, lookup_row
 from vergence_models.lite.network import LiteNetwork, LiteState
 from vergence_models.stepping import OnnxNetwork
@@ -167,3 +170,23 @@ def test_lookups_interpolate_and_are_zero_outside() -> None:
     volume = torch.arange(8.0).view(1, 1, 1, 8) ** 2
     row = lookup_row(volume, torch.full((1, 1, 1, 1), 3.5), 1)
     assert row.flatten().tolist() == pytest.approx([6.5, 12.5, 20.5])
+
+
+class Clamped(nn.Module):
+    """Columns that lie outside of an image, moved to its border."""
+
+    def forward(self, *inputs: torch.Tensor) -> torch.Tensor:
+        (columns,) = inputs
+        return columns.clamp(0, columns.shape[1] - 1) + 0.5
+
+
+def test_a_clamp_to_a_size_is_one_operator(tmp_path: Path) -> None:
+    path = tmp_path / "clamped.onnx"
+    export_part(Part(Clamped(), (torch.zeros(1, 16),), ({1: 8 * COLUMNS},), ("x",), ("y",)), path)
+    operators = [node.op_type for node in onnx.load(path).graph.node]
+    assert operators.count("Clip") == 1
+    assert not {"Max", "Min"} & set(operators)
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    columns = np.arange(-4, 28, dtype=np.float32)[None]
+    (got,) = session.run(None, {"x": columns})
+    np.testing.assert_array_equal(got, columns.clip(0, 31) + 0.5)
