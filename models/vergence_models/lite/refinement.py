@@ -24,7 +24,7 @@ from vergence_models.lite.hypotheses import Hypotheses
 from vergence_models.lite.volume import Volume, lookup, lookup_row
 from vergence_models.warp import cell_centres
 
-SURFACES = 6  # hypotheses of a cell
+SURFACES = 3  # hypotheses of a cell
 FINE_PX = 2  # spacing of the fine descriptors along the right row, and so of the disparities
 REACH = 2  # entries looked up on either side of the current disparity
 TAPS = 2 * REACH + 1
@@ -51,13 +51,11 @@ class Refinement(nn.Module):
         super().__init__()
         width = config.fine_channels
         self.hidden = conv(config.hidden, 16, kernel=1)
-        self.first = conv(config.context_quarter + 16 + 4 * SURFACES, width, kernel=1)
+        self.first = conv(config.context_quarter + 16 + 4 * SURFACES + 1, width, kernel=1)
         self.down = conv(width, config.fine_low, stride=2)
         self.low = conv(config.fine_low, config.fine_low)
         self.lower = conv(config.fine_low, config.fine_low)
         self.back = silent(conv(config.fine_low, width, kernel=1))
-        self.deeper = conv(width, width)
-        self.deepest = silent(conv(width, width))
         self.choose = silent(conv(width, SURFACES))
         self.second = conv(width + 2 * TAPS + 6, width)
         self.out = silent(conv(width, 3, kernel=1))
@@ -73,7 +71,7 @@ class Refinement(nn.Module):
         prior: Tensor,
         context: Tensor,
     ) -> Refined:
-        """Choose and fit. Hypotheses are the surface of 1/8, the prior, and the rims of both.
+        """Choose and fit. Hypotheses are the surface of 1/8 and its rims.
 
         Volume of :func:`near_pairs` at 1/4; px at 1/8 and, 0 where unknown, at 1/4; hidden state at
         1/8, context at 1/4.
@@ -87,17 +85,17 @@ class Refinement(nn.Module):
         plain = F.interpolate(d_eighth, scale_factor=2.0, mode="bilinear")
         hole = (prior <= 0).to(prior.dtype)
         carried = prior + hole * plain
-        surfaces = torch.cat((plain, enlarge(rims(d_eighth)), carried, rims(carried)), dim=1)
+        surfaces = torch.cat((plain, enlarge(rims(d_eighth))), dim=1)
         cost = lookup(pairs, position(surfaces))
         wide = box3(cost)
         apart = squash(surfaces[:, 1:] - plain, 2.0)
+        moved = squash(carried - plain, 2.0)
         up = enlarge(self.hidden(hidden))
-        told = torch.cat((cost, wide, apart, hole, beyond(surfaces, scale=4)), dim=1)
+        told = torch.cat((cost, wide, apart, moved, hole, beyond(surfaces, scale=4)), dim=1)
         x = F.relu(joint(self.first, context, up, told))
         # Where an object ends shows in a wider view than 3x3 cells.
         low = F.relu6(self.lower(F.relu6(self.low(F.relu6(self.down(x))))))
         x = F.relu(x + enlarge(self.back(low)))
-        x = F.relu(x + self.deepest(F.relu(self.deeper(x))))
         fixed = cost * self.sharpness[0] + wide * self.sharpness[1]
         hypotheses = Hypotheses(surfaces, fixed + 4 * self.choose(x))
         d = hypotheses.mean()
@@ -113,7 +111,7 @@ class Refinement(nn.Module):
         step = carried - d
         # Interpolated entries flatten a peak between two of them: tell where between them it lies.
         phase = (looked_at - torch.floor(looked_at)).detach()
-        fitted = (taps, smooth, squash(step, 0.5), squash(offset, 0.5), apart[:, :2], phase, hole)
+        fitted = (taps, smooth, squash(step, 0.5), squash(offset, 0.5), apart, phase, hole)
         x = F.relu(joint(self.second, x, torch.cat(fitted, dim=1)))
         out = self.out(x)
         # The previous frame's surface is evidence too, while it agrees: half of a small step.
