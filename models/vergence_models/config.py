@@ -94,7 +94,7 @@ class Config:
 
 
 # Windows of a sharper camera need less blowing up; a stereo pair alone has to be good too.
-LITE_TRAINING = TrainingConfig(decay_steps=16_000, stretch_share=0.3, reset_share=0.25)
+LITE_TRAINING = TrainingConfig(frames=6, decay_steps=22_000, stretch_share=0.3, reset_share=0.15)
 # The paper's: Adam, no weight decay, an L1 loss that weighs every frame alike.
 RAFT_TRAINING = TrainingConfig(
     learning_rate=4e-4, weight_decay=0.0, cold_iterations=6, precision=Precision.BF16
