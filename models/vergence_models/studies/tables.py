@@ -110,8 +110,9 @@ def markdown(tables: Sequence[Table], missing: Sequence[str], plots: Iterable[st
         parts.append(f"Without weights, and so left out of every table: {names}.")
     for table in tables:
         parts.append(_section(with_times(table, times)))
-        if table.name in drawn:
-            parts.append(f"![{table.title}]({table.name}.png)")
+        picture = "runtime" if table is times else table.name
+        if picture in drawn:
+            parts.append(f"![{table.title}]({picture}.png)")
     return "\n\n".join(parts) + "\n"
 
 
