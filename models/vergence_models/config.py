@@ -78,7 +78,7 @@ class TrainingConfig:
     noise_m: float = 0.002
     clean_share: float = 0.3  # clips without the sensor's flaws
     reset_share: float = 0.1  # frames that lose their state
-    foreign_share: float = 0.1  # frames whose state is in part that of another clip
+    foreign_share: float = 0.1  # frames whose state is in part another clip's of the batch
     cold_iterations: int = 4  # at most, drawn anew for every frame without a state
     precision: Precision = Precision.FP32
 

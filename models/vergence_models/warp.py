@@ -161,7 +161,7 @@ def splat_levels(
 
 def warp_state(
     disparity: Tensor, hidden: Tensor, uvd_curr_from_prev: Tensor, *, scale: int, hidden_scale: int
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor]:
     """Take the previous frame's disparity and hidden state to the current view.
 
     Forward splat of the one-channel disparity finds which surface is seen where; from there each
@@ -171,7 +171,7 @@ def warp_state(
 
     Args: ``disparity`` [B, 1, H/s, W/s] px at full resolution, 0 = nothing; ``hidden``
     [B, C, H/s', W/s']; ``uvd_curr_from_prev`` [B, 4, 4]. Returns prior disparity [B, 1, H/s, W/s]
-    (0 in holes), its hole mask (1 = nothing known), and the hidden state (0 in holes).
+    and hidden state; both are 0 in holes, where nothing is known.
     """
     previous = disparity[:, 0]
     _, height, width = previous.shape
@@ -203,4 +203,4 @@ def warp_state(
     carried = sample_bilinear(
         hidden, (u_low + 0.5) / hidden_scale - 0.5, (v_low + 0.5) / hidden_scale - 0.5
     )
-    return prior[:, None], 1 - seen[:, None], carried * low_seen
+    return prior[:, None], carried * low_seen

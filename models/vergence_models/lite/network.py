@@ -1,9 +1,10 @@
 """The network of `lite`: a wide coarse search, a narrow fine one, and time to join them.
 
 The wide search is coarse (every disparity, cells of 1/8), the narrow one fine (a handful of
-hypotheses per cell of 1/4); time joins them: the previous disparity, moved to the new view, is one
-more hypothesis in both. Choosing and blending is learned; matching itself starts from fixed census
-descriptors, so the untrained network is already a stereo matcher.
+hypotheses per cell of 1/4); time joins them: the previous disparity, moved to the new view, is what
+the wide search starts from, and what the answer of the narrow one is blended with where they agree.
+Choosing and blending is learned; matching itself starts from fixed census descriptors, so the
+untrained network is already a stereo matcher.
 
 An iteration is all that depends on what is expected: both choices and the recurrent cell. The next
 iteration expects its answer, as the next frame does; so a second one is what seeing the same frame
@@ -71,6 +72,15 @@ class Guess(NamedTuple):
         return 0.3 * masked_mean(error, known(truth, max_disparity_px)) + 0.3 * unlikely
 
 
+class Iteration(NamedTuple):
+    """What one iteration found."""
+
+    answer: Refined
+    hidden: Tensor  # [B, C, H/8, W/8]
+    scores: Tensor  # of the wide search, as in LiteEstimate
+    guesses: tuple[Guess, Guess]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class LiteEstimate(Estimate):
     """The answer, and the guesses on the way to it."""
@@ -113,16 +123,15 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
     ) -> tuple[LiteEstimate, LiteState]:
         evidence = self.search(left, right)
         disparity, hidden = LiteState(*state)
-        prior, _, hidden = warp_state(
-            disparity, hidden, uvd_curr_from_prev, scale=4, hidden_scale=8
-        )
-        following = LiteState(prior, hidden)
+        moved = warp_state(disparity, hidden, uvd_curr_from_prev, scale=4, hidden_scale=8)
+        following = LiteState(*moved)
         guesses: list[Guess] = []
         for _ in range(iterations):
-            answer, following, scores = self.iterate(evidence, following, guesses)
-        disparity, sigma = self.refinement.enlarged(answer)
-        estimate = LiteEstimate(disparity, sigma, scores, guesses)
-        return estimate, following
+            found = self.iterate(evidence, following)
+            following = LiteState(found.answer.disparity, found.hidden)
+            guesses += found.guesses
+        disparity, sigma = self.refinement.enlarged(found.answer)
+        return LiteEstimate(disparity, sigma, found.scores, guesses), following
 
     def search(self, left: Tensor, right: Tensor) -> Evidence:
         """What the images say by themselves; [B, H, W, 3] uint8 each."""
@@ -139,13 +148,8 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         coarse = banded(pairs, self.config.max_disparity_px // BIN_PX)
         return Evidence(fine, coarse, *self.context(left_rows))
 
-    def iterate(
-        self, evidence: Evidence, state: LiteState, guesses: list[Guess]
-    ) -> tuple[Refined, LiteState, Tensor]:
-        """From the surface that is expected to a better one, by both searches.
-
-        Returns the answer at 1/4, the state that expects it, and the coarse scores.
-        """
+    def iterate(self, evidence: Evidence, state: LiteState) -> Iteration:
+        """From the surface that is expected to a better one, by both searches."""
         prior, hidden = state
         seen = (prior > 0).to(prior.dtype)
         seen8 = F.avg_pool2d(seen, 2)
@@ -167,9 +171,8 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
             context=evidence.context8,
         )
         answer = self.refinement(evidence.fine, d, hidden, prior, evidence.context4)
-        guesses.append(Guess(d, hypotheses, 8))
-        guesses.append(Guess(answer.disparity, answer.hypotheses, 4))
-        return answer, LiteState(answer.disparity, hidden), scores.scores
+        guesses = Guess(d, hypotheses, 8), Guess(answer.disparity, answer.hypotheses, 4)
+        return Iteration(answer, hidden, scores.scores, guesses)
 
 
 def interleave(image: Tensor) -> Tensor:

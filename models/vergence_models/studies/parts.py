@@ -33,14 +33,9 @@ COLUMNS = {
 NEVER = -1e3  # a logit
 
 
-def never_chosen(*hypotheses: int) -> Callable[[LiteNetwork], None]:
-    """Hypotheses at 1/4, numbered as the refinement lists them, lose every choice."""
-
-    def silence(network: LiteNetwork) -> None:
-        assert network.refinement.choose.bias is not None
-        network.refinement.choose.bias[list(hypotheses)] = NEVER
-
-    return silence
+def rims_never_chosen(network: LiteNetwork) -> None:
+    assert network.refinement.choose.bias is not None
+    network.refinement.choose.bias[1:] = NEVER  # the first is the surface itself
 
 
 def silenced(*layers: str) -> Callable[[LiteNetwork], None]:
@@ -73,7 +68,7 @@ PARTS: dict[str, Callable[[LiteNetwork], None]] = {
     "1/8: scores do not know the image": silenced("cost_filter.context"),
     "1/8: scores do not know the previous surface": prior_unseen,
     "1/8: no doubt about matches another surface claims": claims_unseen,
-    "1/4: no rims, only the surface of 1/8": never_chosen(1, 2),
+    "1/4: no rims, only the surface of 1/8": rims_never_chosen,
     "1/4: no wider view": silenced("refinement.back"),
     "1/4: no sub-pixel fit": silenced("refinement.subpixel"),
     "1/4: no last correction": silenced("refinement.out"),
