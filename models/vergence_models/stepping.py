@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime
@@ -14,15 +15,7 @@ from numpy.typing import NDArray
 from vergence_models.data.clips import StereoClips
 from vergence_proto.geometry import Pose, RectifiedRig, uvd_curr_from_prev
 from vergence_proto.layouts import LayoutError, StereoSource
-from vergence_proto.model_io import (
-    DISPARITY,
-    LEFT,
-    RIGHT,
-    SIGMA,
-    UVD_CURR_FROM_PREV,
-    ModelCard,
-    load_model_card,
-)
+from vergence_proto.model_io import ModelCard, load_model_card
 
 Image = NDArray[np.uint8]
 Plane = NDArray[np.float32]
@@ -143,7 +136,7 @@ class SteppedNetwork(ABC):
 
 
 class OnnxNetwork(SteppedNetwork):
-    """The graphs of one model under onnxruntime on the CPU."""
+    """The graphs of one model under onnxruntime on the CPU, one after the other."""
 
     def __init__(self, weights: Path, name: str, *, threads: int = 2) -> None:
         """Raises ManifestError: no such model, or a file of it is damaged."""
@@ -152,9 +145,12 @@ class OnnxNetwork(SteppedNetwork):
         options.intra_op_num_threads = threads
         # As the service sets it: threads that always spin cost the other core's time.
         options.add_session_config_entry("session.intra_op.spin_duration_us", "20")
+        graphs = {
+            path for stages in self.card.graphs.values() for stage in stages for path in stage
+        }
         self._sessions = {
-            count: onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-            for count, path in self.card.graphs.items()
+            path: onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+            for path in graphs
         }
 
     def run(
@@ -165,13 +161,13 @@ class OnnxNetwork(SteppedNetwork):
         state: State,
         iterations: int,
     ) -> tuple[Plane, Plane, State]:
-        feed: dict[str, NDArray[np.generic]] = {
-            LEFT: left,
-            RIGHT: right,
-            UVD_CURR_FROM_PREV: uvd_curr_from_prev,
-        }
-        for tensor, value in zip(self.card.state, state, strict=True):
-            feed[tensor.input_name] = value
-        outputs = [DISPARITY, SIGMA, *(tensor.output_name for tensor in self.card.state)]
-        disparity, sigma, *following = self._sessions[iterations].run(outputs, feed)
+        given = (left, right, uvd_curr_from_prev, *state)
+        # Of any type: what one stage hands the next is the exporter's own business.
+        tensors: dict[str, Any] = dict(zip(self.card.input_names, given, strict=True))
+        for stage in self.card.graphs[iterations]:
+            for session in (self._sessions[path] for path in stage):
+                feed = {entry.name: tensors[entry.name] for entry in session.get_inputs()}
+                names = [entry.name for entry in session.get_outputs()]
+                tensors |= zip(names, session.run(names, feed), strict=True)
+        disparity, sigma, *following = (tensors[name] for name in self.card.output_names)
         return disparity, sigma, tuple(following)

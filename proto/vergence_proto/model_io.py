@@ -1,7 +1,11 @@
 """The contract between whoever exports a network and whoever serves it.
 
-A model is a set of ONNX graphs over the same weights, one per iteration count, and a manifest
-that describes them. One run of a graph is one step of the recurrence, for a batch of streams.
+A model is a set of ONNX graphs over the same weights, and a manifest that describes them. One
+step of the recurrence, for a batch of streams, runs the graphs of its iteration count in stages.
+The graphs of a stage do not need each other and may run side by side; each takes, by name, what
+the caller gives or what a graph of an earlier stage gave. Any graph may give an output of the
+model, and no two graphs of a count give the same name. Most models have a single graph per count:
+one stage of one graph.
 
 Inputs:
 
@@ -37,11 +41,14 @@ DISPARITY = "disparity"
 SIGMA = "sigma"
 
 MANIFEST_NAME = "manifest.json"
-MANIFEST_FORMAT = 1
+MANIFEST_FORMAT = 2
+
+Stage = tuple[Path, ...]  # graphs that may run side by side
+Stages = tuple[Stage, ...]  # one step, in the order in which its stages run
 
 
 class ManifestError(ValueError):
-    """A manifest or a graph it names is missing, damaged, or of another format."""
+    """A manifest or a file it names is missing, damaged, of another format, or does not fit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,9 +78,19 @@ class ModelCard:
     name: str
     stride: int  # H and W of a step are multiples of it
     max_disparity_px: int
-    state: tuple[StateTensor, ...]  # in the order of the graph's inputs
-    graphs: Mapping[int, Path]  # iterations -> file
-    weights_sha256: str  # of all graphs together: the identity told to clients
+    state: tuple[StateTensor, ...]
+    graphs: Mapping[int, Stages]  # by iterations
+    weights_sha256: str  # of all files together: the identity told to clients
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """What the caller of a step gives."""
+        return LEFT, RIGHT, UVD_CURR_FROM_PREV, *(tensor.input_name for tensor in self.state)
+
+    @property
+    def output_names(self) -> tuple[str, ...]:
+        """What the caller of a step gets."""
+        return DISPARITY, SIGMA, *(tensor.output_name for tensor in self.state)
 
     def step_size(self, height: int, width: int) -> tuple[int, int]:
         """The size [H, W] that images are grown to: whole strides, every disparity inside."""
@@ -99,9 +116,10 @@ class ModelCard:
 
 
 def load_model_card(weights_dir: Path, name: str) -> ModelCard:
-    """Read one model's card from ``weights_dir`` and check its graphs against their sha256.
+    """Read one model's card from ``weights_dir`` and check its files against their sha256.
 
-    Raises ManifestError: file missing, unknown format, unknown model, or a hash that differs.
+    Raises ManifestError: file missing or without a sha256, unknown format, unknown model, or a
+    hash that differs.
     """
     path = weights_dir / MANIFEST_NAME
     try:
@@ -121,22 +139,26 @@ def load_model_card(weights_dir: Path, name: str) -> ModelCard:
             "Name the folder that another was exported to"
         )
     entry = models[name]
-    graphs = {int(count): weights_dir / graph["file"] for count, graph in entry["graphs"].items()}
-    digests = {
-        count: _checked_digest(path, entry["graphs"][str(count)]["sha256"])
-        for count, path in graphs.items()
+    # The graphs, and what large networks keep beside them because their graphs have it in common.
+    files = entry["files"]
+    digests = [_checked_digest(weights_dir / file, files[file]) for file in sorted(files)]
+    graphs = {
+        int(count): tuple(tuple(weights_dir / file for file in stage) for stage in stages)
+        for count, stages in entry["graphs"].items()
     }
-    # Large networks keep what their graphs have in common in one file beside them.
-    shared = [entry["weights"]] if "weights" in entry else []
-    hashes = [digests[count] for count in sorted(digests)]
-    hashes += [_checked_digest(weights_dir / each["file"], each["sha256"]) for each in shared]
+    for graph in (graph for stages in graphs.values() for stage in stages for graph in stage):
+        if graph.name not in files:
+            raise ManifestError(
+                f"{path}: model {name!r} runs {graph.name}, which is not among its files; "
+                "export the model anew"
+            )
     return ModelCard(
         name=name,
         stride=entry["stride"],
         max_disparity_px=entry["max_disparity_px"],
         state=tuple(StateTensor(**tensor) for tensor in entry["state"]),
         graphs=graphs,
-        weights_sha256=hashlib.sha256(b"".join(hashes)).hexdigest(),
+        weights_sha256=hashlib.sha256(b"".join(digests)).hexdigest(),
     )
 
 

@@ -4,7 +4,7 @@ import asyncio
 import signal
 import time
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, closing
 from dataclasses import dataclass
 
 from prometheus_client import CollectorRegistry
@@ -129,10 +129,11 @@ async def serve(settings: Settings, *, on_serving: Callable[[Running], None]) ->
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
-    async with running(settings, make_model(settings)) as server:
-        on_serving(server)
-        await stop.wait()
-        await drain(server, within_s=settings.grpc.drain_s)
+    with closing(make_model(settings)) as model:
+        async with running(settings, model) as server:
+            on_serving(server)
+            await stop.wait()
+            await drain(server, within_s=settings.grpc.drain_s)
 
 
 async def drain(server: Running, *, within_s: float) -> None:

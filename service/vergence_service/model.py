@@ -5,7 +5,6 @@ may step it again; a sequence is a pure function of its frames.
 """
 
 import importlib.util
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,6 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from onnxruntime import InferenceSession, SessionOptions
 
 from vergence_proto.errors import NonFinite
 from vergence_proto.geometry import Pose, RectifiedRig, uvd_curr_from_prev
@@ -27,20 +25,9 @@ from vergence_proto.model_io import (
     load_model_card,
 )
 from vergence_proto.types import Image, Plane
-from vergence_service.providers import (
-    Resident,
-    device_of,
-    require_provider,
-    run_on_device,
-    start_session,
-)
+from vergence_service.providers import Resident, Tensor, device_of, require_provider
+from vergence_service.stages import StagedGraphs
 
-log = logging.getLogger(__name__)
-
-# [C, h, w], or [1, C, h, w] where it stayed on a device.
-Tensor = NDArray[np.float32] | Resident
-
-_MAPS = (DISPARITY, SIGMA)
 _NO_MOTION = np.eye(4, dtype=np.float32)
 
 
@@ -60,7 +47,8 @@ class View:
 class RecurrentState:
     """What one step hands to the next: the network's tensors, and the view they belong to."""
 
-    tensors: tuple[Tensor, ...]  # in the order of the model card
+    # In the order of the model card: [C, h, w], or [1, C, h, w] where it stayed on a device.
+    tensors: tuple[Tensor, ...]
     rig: RectifiedRig
     capture_ns: int
     world_from_left: Pose | None
@@ -142,11 +130,11 @@ class StereoModel(Protocol):
 
 
 class OnnxStereoModel:
-    """A model of the manifest under onnxruntime: one graph per iteration count.
+    """A model of the manifest under onnxruntime.
 
     States stay where the first provider computes them; ``states_on`` names another device.
-    Raises ManifestError (see :func:`vergence_proto.model_io.load_model_card`) and
-    ProviderUnavailable.
+    ``threads`` are those of one step, 0 for one a core. Raises ManifestError (see
+    :func:`vergence_proto.model_io.load_model_card`) and ProviderUnavailable.
     """
 
     def __init__(
@@ -160,18 +148,15 @@ class OnnxStereoModel:
         states_on: str | None = None,
     ) -> None:
         self._card = load_model_card(weights_dir, name)
-        self._providers = [require_provider(provider) for provider in providers]
+        self._provider = require_provider(providers[0])
         self._device = states_on or device_of(providers[0])
-        self._options = SessionOptions()
-        self._options.intra_op_num_threads = threads
-        # Planning the reuse of buffers took a second of a long graph's start and saved no memory:
-        # the arena gives freed buffers out again without a plan, and steps are as quick.
-        self._options.enable_mem_reuse = False
-        if not allow_spinning:
-            # As long as the next operator of a step may take to come, never between steps.
-            self._options.add_session_config_entry("session.intra_op.spin_duration_us", "20")
-        self._next = [tensor.output_name for tensor in self._card.state]
-        self._sessions: dict[int, InferenceSession] = {}
+        self._graphs = StagedGraphs(
+            self._card,
+            providers=[require_provider(provider) for provider in providers],
+            threads=threads,
+            allow_spinning=allow_spinning,
+            device=self._device,
+        )
 
     @property
     def card(self) -> ModelCard:
@@ -179,11 +164,15 @@ class OnnxStereoModel:
 
     @property
     def provider(self) -> str:
-        return self._providers[0]
+        return self._provider
 
     def warm_up(self, iterations: Sequence[int]) -> None:
         for count in iterations:
-            self._session(count)
+            self._graphs.load(count)
+
+    def close(self) -> None:
+        """End the threads that steps use; none may follow."""
+        self._graphs.close()
 
     def step(self, steps: Sequence[Step]) -> list[StepResult]:
         # Row by row where a batch gains nothing: a CPU's kernels sum in an order that depends on
@@ -194,20 +183,13 @@ class OnnxStereoModel:
 
     def _step(self, steps: Sequence[Step]) -> list[StepResult]:
         height, width = steps[0].view.left.shape[:2]
-        session, feeds = self._session(steps[0].iterations), self._feeds(steps)
-        tensors: Sequence[Tensor]
-        if self._device is None:
-            disparity, sigma, *tensors = session.run([*_MAPS, *self._next], feeds)
-            to_check = [disparity, sigma, *tensors]
-        else:
-            (disparity, sigma), tensors = run_on_device(
-                session, feeds, to_host=_MAPS, to_stay=self._next, device=self._device
-            )
-            # What is not finite in a state that stays shows in the maps of the next step.
-            to_check = [disparity, sigma]
+        found = self._graphs.run(steps[0].iterations, self._feeds(steps))
+        # What is not finite in a state that stays shows in the maps of the next step.
+        to_check = [values for values in found.values() if not isinstance(values, Resident)]
         if not all(np.isfinite(values).all() for values in to_check):
             raise NonFinite("the network's result was not finite; the stream starts anew")
-        states = _rows(tensors, len(steps))
+        disparity, sigma = _batch_on_host(found[DISPARITY]), _batch_on_host(found[SIGMA])
+        states = _rows([found[tensor.output_name] for tensor in self._card.state], len(steps))
         return [
             StepResult(
                 disparity[row, :height, :width],
@@ -234,24 +216,21 @@ class OnnxStereoModel:
             )
         return feeds
 
-    def _session(self, iterations: int) -> InferenceSession:
-        if iterations not in self._sessions:
-            graph = self._card.graphs[iterations]
-            self._sessions[iterations] = start_session(graph, self._options, self._providers)
-            log.info("loaded %s, %d iterations", self._card.name, iterations)
-        return self._sessions[iterations]
-
 
 def on_host(tensor: Tensor) -> NDArray[np.float32]:
     """[C, h, w], wherever it was."""
     return tensor.on_host()[0] if isinstance(tensor, Resident) else tensor
 
 
+def _batch_on_host(tensor: Tensor) -> NDArray[np.float32]:
+    return tensor.on_host() if isinstance(tensor, Resident) else tensor
+
+
 def _rows(tensors: Sequence[Tensor], count: int) -> list[tuple[Tensor, ...]]:
     """The states of the rows of a batch. A lone one stays where it is, several go to the host."""
     if count == 1 and isinstance(tensors[0], Resident):
         return [tuple(tensors)]
-    batches = [each.on_host() if isinstance(each, Resident) else each for each in tensors]
+    batches = [*map(_batch_on_host, tensors)]
     return [tuple(batch[row] for batch in batches) for row in range(count)]
 
 

@@ -32,7 +32,7 @@ class ProviderUnavailable(RuntimeError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Resident:
-    """A float32 tensor that stays on its device."""
+    """A tensor that stays on its device; one of a state is float32."""
 
     value: onnxruntime.OrtValue
 
@@ -43,6 +43,9 @@ class Resident:
     def on_host(self) -> NDArray[np.float32]:
         copy: NDArray[np.float32] = self.value.numpy()
         return copy
+
+
+Tensor = NDArray[np.float32] | Resident
 
 
 def require_provider(name: str) -> str:

@@ -1,7 +1,5 @@
 """The served model itself, with the weights that ship: batches, sizes, failures."""
 
-import hashlib
-import json
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +7,9 @@ import onnxruntime
 import pytest
 
 from tests.support.frames import make_frame
+from tests.support.weights_copy import WEIGHTS
 from vergence_proto.errors import NonFinite
 from vergence_proto.geometry import RectifiedRig
-from vergence_proto.model_io import MANIFEST_NAME
 from vergence_service.model import (
     OnnxStereoModel,
     RecurrentState,
@@ -143,7 +141,7 @@ def test_padding_is_the_edge_repeated(model: OnnxStereoModel) -> None:
 
 def test_a_result_that_is_not_finite_is_not_passed_on() -> None:
     """The graph of the test weights divides by brightness."""
-    model = make_model("reciprocal", weights=Path(__file__).parents[1] / "support" / "weights")
+    model = make_model("reciprocal", weights=WEIGHTS)
     bright = np.full((8, 8, 3), 50, np.uint8)
     [result] = model.step([Step(View(bright, bright, RIG, 1), None, 1)])
     np.testing.assert_allclose(result.offset_px, 1 / 150, rtol=1e-6)
@@ -202,10 +200,3 @@ def test_a_provider_that_is_not_there_is_refused_with_what_to_install(
             packaged_weights_dir(), "lite", providers=[provider], threads=1, allow_spinning=False
         )
     assert require_provider("cpu") == PROVIDERS["cpu"]
-
-
-def test_the_manifest_names_what_is_there(model: OnnxStereoModel) -> None:
-    manifest = json.loads((packaged_weights_dir() / MANIFEST_NAME).read_text("utf-8"))
-    for graph in manifest["models"]["lite"]["graphs"].values():
-        content = (packaged_weights_dir() / graph["file"]).read_bytes()
-        assert hashlib.sha256(content).hexdigest() == graph["sha256"]

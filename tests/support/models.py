@@ -26,7 +26,7 @@ class RecallModel:
         stride=1,
         max_disparity_px=64,
         state=(StateTensor("memory", channels=1, scale=1),),
-        graphs={1: Path("recall-1"), 4: Path("recall-4")},
+        graphs={1: ((Path("recall-1"),),), 4: ((Path("recall-4"),),)},
         weights_sha256="0" * 64,
     )
 

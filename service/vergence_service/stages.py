@@ -1,0 +1,175 @@
+"""The graphs of a model, run as :mod:`vergence_proto.model_io` says: stage after stage.
+
+The graphs of a stage run side by side, on threads of their own. Where a network has large parts
+that do not need each other, that is as quick as to divide every operator between the same threads,
+for less work: the threads meet once a stage and each keeps to its own cache.
+"""
+
+import logging
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from onnxruntime import InferenceSession, SessionOptions
+
+from vergence_proto.model_io import DISPARITY, SIGMA, ManifestError, ModelCard, Stage
+from vergence_service.providers import Resident, Tensor, run_on_device, start_session
+
+log = logging.getLogger(__name__)
+
+Tensors = Mapping[str, NDArray[np.generic] | Resident]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Part:
+    """A graph as the steps of one iteration count use it."""
+
+    session: InferenceSession
+    inputs: tuple[str, ...]
+    to_host: tuple[str, ...]
+    to_stay: tuple[str, ...]
+
+    @classmethod
+    def of(cls, session: InferenceSession, needed: set[str]) -> "_Part":
+        """The part that gives whatever is ``needed`` and the graph has."""
+        outputs = [name for name in _output_names(session) if name in needed]
+        maps = tuple(name for name in outputs if name in (DISPARITY, SIGMA))
+        rest = tuple(name for name in outputs if name not in maps)
+        return cls(session, _input_names(session), maps, rest)
+
+    def run(self, tensors: Tensors, device: str | None) -> dict[str, Tensor]:
+        feeds = {name: tensors[name] for name in self.inputs}
+        names = (*self.to_host, *self.to_stay)
+        if device is None:
+            return dict(zip(names, self.session.run(names, feeds), strict=True))
+        host, stayed = run_on_device(
+            self.session, feeds, to_host=self.to_host, to_stay=self.to_stay, device=device
+        )
+        return dict(zip(names, [*host, *stayed], strict=True))
+
+
+class StagedGraphs:
+    """The graphs of a model, each loaded once. Called from one thread at a time.
+
+    ``providers`` are onnxruntime's names. A step uses ``threads`` threads, 0 for one a core; with
+    one, the graphs of a stage run one after the other. With a ``device`` all but the maps stays
+    there, from stage to stage and in what a step returns.
+    """
+
+    def __init__(
+        self,
+        card: ModelCard,
+        *,
+        providers: Sequence[str],
+        threads: int,
+        allow_spinning: bool,
+        device: str | None,
+    ) -> None:
+        self._card = card
+        self._providers = providers
+        self._threads = threads
+        self._allow_spinning = allow_spinning
+        self._device = device
+        self._sessions: dict[tuple[Path, int], InferenceSession] = {}
+        self._steps: dict[int, list[list[_Part]]] = {}
+        widest = max(len(stage) for stages in card.graphs.values() for stage in stages)
+        beside = min(threads or _cores(), widest) - 1  # the caller's thread takes a graph as well
+        self._beside = ThreadPoolExecutor(beside, thread_name_prefix="graph") if beside else None
+
+    def close(self) -> None:
+        """End the threads; no step may follow."""
+        if self._beside is not None:
+            self._beside.shutdown()
+
+    def load(self, iterations: int) -> None:
+        """Raises ManifestError, the graphs do not fit together, and ProviderUnavailable."""
+        if iterations in self._steps:
+            return
+        stages = [self._loaded(stage) for stage in self._card.graphs[iterations]]
+        _require_fit(self._card, iterations, stages)
+        needed = set(self._card.output_names)
+        parts: list[list[_Part]] = []
+        for stage in reversed(stages):
+            parts.insert(0, [_Part.of(session, needed) for session in stage])
+            needed.update(name for part in parts[0] for name in part.inputs)
+        self._steps[iterations] = parts
+        log.info("loaded %s, %d iterations", self._card.name, iterations)
+
+    def run(self, iterations: int, given: Tensors) -> dict[str, Tensor]:
+        """One step of a batch: the card's inputs to the card's outputs, by name."""
+        self.load(iterations)
+        found: dict[str, Tensor] = {}
+        for parts in self._steps[iterations]:
+            for outputs in self._side_by_side(parts, {**given, **found}):
+                found |= outputs
+        return {name: found[name] for name in self._card.output_names}
+
+    def _side_by_side(self, parts: Sequence[_Part], tensors: Tensors) -> list[dict[str, Tensor]]:
+        if self._beside is None:
+            return [part.run(tensors, self._device) for part in parts]
+        first, *others = parts
+        futures: list[Future[dict[str, Tensor]]] = []
+        try:
+            futures += (self._beside.submit(part.run, tensors, self._device) for part in others)
+            outputs = first.run(tensors, self._device)
+        finally:
+            wait(futures)  # also where one fails: no graph runs on into the next step
+        return [outputs, *(future.result() for future in futures)]
+
+    def _loaded(self, stage: Stage) -> list[InferenceSession]:
+        threads = self._threads  # alone: onnxruntime knows best what "one a core" is
+        if len(stage) > 1:
+            threads = max(1, (threads or _cores()) // len(stage))
+        return [self._session(path, threads) for path in stage]
+
+    def _session(self, graph: Path, threads: int) -> InferenceSession:
+        if (graph, threads) not in self._sessions:
+            options = SessionOptions()
+            options.intra_op_num_threads = threads
+            # Planning the reuse of buffers took a second of a long graph's start and saved no
+            # memory: the arena gives freed buffers out again without a plan, and steps are as
+            # quick.
+            options.enable_mem_reuse = False
+            if not self._allow_spinning:
+                # As long as the next operator of a step may take to come, never between steps.
+                options.add_session_config_entry("session.intra_op.spin_duration_us", "20")
+            self._sessions[graph, threads] = start_session(graph, options, self._providers)
+        return self._sessions[graph, threads]
+
+
+def _require_fit(
+    card: ModelCard, iterations: int, stages: Sequence[Sequence[InferenceSession]]
+) -> None:
+    """Raises ManifestError: an input comes from nowhere, an output from nowhere or from two."""
+    step = f"{card.name}, {iterations} iterations"
+    known = set(card.input_names)
+    for stage in stages:
+        for session in stage:
+            if missing := set(_input_names(session)) - known:
+                raise ManifestError(
+                    f"{step}: expected {', '.join(sorted(missing))} from a graph of an earlier "
+                    "stage; the graphs are of different exports"
+                )
+        for session in stage:
+            if twice := known.intersection(_output_names(session)):
+                raise ManifestError(f"{step}: more than one graph gives {', '.join(sorted(twice))}")
+            known.update(_output_names(session))
+    if missing := set(card.output_names) - known:
+        raise ManifestError(f"{step}: no graph gives {', '.join(sorted(missing))}")
+
+
+def _input_names(session: InferenceSession) -> tuple[str, ...]:
+    return tuple(entry.name for entry in session.get_inputs())
+
+
+def _output_names(session: InferenceSession) -> tuple[str, ...]:
+    return tuple(entry.name for entry in session.get_outputs())
+
+
+def _cores() -> int:
+    """Those that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
