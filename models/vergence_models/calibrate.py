@@ -7,10 +7,8 @@ own state, so that the ranges are those of recurrent use.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
-import onnx
 import onnxruntime
 from numpy.typing import NDArray
 from onnx import ModelProto, TensorProto, helper
@@ -38,28 +36,28 @@ class QuantizationError(RuntimeError):
 
 
 def make_int8(
-    paths: Mapping[int, Path],
+    models: Mapping[int, ModelProto],
     states: Sequence[StateTensor],
     pool: ClipPool,
     *,
     max_disparity_px: float,
-) -> dict[str, object]:
-    """Replace float graphs, by iteration count, with int8 ones; returns the story for the manifest.
+) -> tuple[dict[int, ModelProto], dict[str, object]]:
+    """Int8 graphs of float ones, by iteration count, and the story for the manifest.
 
-    Raises QuantizationError if that costs the smallest graph more than :data:`MAX_LOSS`, before
-    any is replaced.
+    Raises QuantizationError if the smallest loses more than :data:`MAX_LOSS`.
     """
     clips = filmed(pool, range(RANGE_CLIPS))
+    made: dict[int, ModelProto] = {}
     story: dict[str, object] = {}
-    for count, path in sorted(paths.items()):
-        model = with_weights_apart(onnx.load(path))
+    for count, whole in sorted(models.items()):
+        model = with_weights_apart(whole)
         what = plan(model)
         int8 = quantized(model, what, find_scales(model, what.measured, states, clips))
-        if not story:
+        if not made:
             before, after = (epe_px(each, states, pool, max_disparity_px) for each in (model, int8))
             if not after < MAX_LOSS * before:
                 raise QuantizationError(
-                    f"{path}: EPE {after:.3f} px as int8, {before:.3f} px before; "
+                    f"{count} iterations: EPE {after:.3f} px as int8, {before:.3f} px before; "
                     f"expected less than {MAX_LOSS:g} times as much"
                 )
             story = {
@@ -70,8 +68,8 @@ def make_int8(
                 "epe_px": round(after, 4),
                 "float_epe_px": round(before, 4),
             }
-        onnx.save(int8, path)
-    return story
+        made[count] = int8
+    return made, story
 
 
 def steps(

@@ -18,17 +18,21 @@ from typing import cast
 
 import numpy as np
 import onnx
-import onnxruntime
 import torch
 from numpy.typing import NDArray
+from onnx import ModelProto
 
 from vergence_models.calibrate import make_int8
-from vergence_models.config import Config, load_config
+from vergence_models.config import Config, ConfigError, load_config
 from vergence_models.data.pool import ClipPool
-from vergence_models.graphs import export_part, folded, whole_step
+from vergence_models.graphs import Part, export_part, folded
+from vergence_models.lite.network import LiteNetwork
+from vergence_models.lite.parts import parts_of as lite_parts_of
 from vergence_models.raft.network import RaftNetwork
-from vergence_models.raft.parts import parts_of
+from vergence_models.raft.parts import parts_of as raft_parts_of
 from vergence_models.runs import Run, read_run
+from vergence_models.stages import handed_on, in_stages
+from vergence_models.stepping import OnnxNetwork, SteppedNetwork
 from vergence_models.stitch import Parts, stitched, write_with_shared_weights
 from vergence_models.tiers import AnyNetwork, build_network
 from vergence_proto.model_io import MANIFEST_FORMAT, MANIFEST_NAME
@@ -60,25 +64,21 @@ def shifted_pair(
     return left[None].astype(np.uint8), right[None].astype(np.uint8)
 
 
-def check_parity(network: AnyNetwork, iterations: int, path: Path, *, frames: int = 3) -> float:
+def check_parity(
+    network: AnyNetwork, graphs: SteppedNetwork, iterations: int, *, frames: int = 3
+) -> float:
     """How far 99 % of pixels are from PyTorch's over a short sequence, in px.
 
     Raises ParityError if that is more than :data:`PARITY_PX`.
     """
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 2
-    session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     height, width = 6 * network.config.stride, 8 * network.config.stride
-    state = network.cold_state(1, height, width)
-    arrays = [tensor.numpy() for tensor in state]
+    state, carried = network.cold_state(1, height, width), graphs.cold_state(height, width)
     matrix = np.eye(4, dtype=np.float32)[None]
     matrix[0, 0, 3] = -2.0  # the view pans
     worst = 0.0
     for frame in range(frames):
         left, right = shifted_pair(height, width, 0, pan_px=2 * frame)
-        names = [node.name for node in session.get_inputs()]
-        feed = dict(zip(names, [left, right, matrix, *arrays], strict=True))
-        disparity, sigma, *arrays = session.run(None, feed)
+        disparity, sigma, carried = graphs.run(left, right, matrix, carried, iterations)
         with torch.inference_mode():
             estimate, state = network(
                 torch.from_numpy(left),
@@ -92,8 +92,8 @@ def check_parity(network: AnyNetwork, iterations: int, path: Path, *, frames: in
             worst = max(worst, float(np.quantile(difference, 0.99)))
     if not worst < PARITY_PX:
         raise ParityError(
-            f"{path}: differs from PyTorch by {worst:.2g} px at the 99th percentile, "
-            f"expected less than {PARITY_PX:g}"
+            f"{graphs.card.name}, {iterations} iterations: differs from PyTorch by {worst:.2g} px "
+            f"at the 99th percentile, expected less than {PARITY_PX:g}"
         )
     return worst
 
@@ -101,80 +101,99 @@ def check_parity(network: AnyNetwork, iterations: int, path: Path, *, frames: in
 def export_run(run: Run, config: Config, out: Path, *, int8_clips: ClipPool | None = None) -> None:
     """Write every graph of one tier and its entry of the manifest; other entries stay.
 
-    With ``int8_clips`` the graphs that were checked are replaced by int8 ones.
+    With ``int8_clips`` the graphs are int8 ones, made of those that were checked.
     """
     network = build_network(run.network).eval()
     network.load_state_dict(run.weights)
-    out.mkdir(parents=True, exist_ok=True)
-    paths = {count: out / f"{config.name}_{count}.onnx" for count in config.iterations}
+    parts = exported_parts(network)
+    models = {count: stitched(parts, count) for count in config.iterations}
     entry: dict[str, object] = {
         "stride": run.network.stride,
         "max_disparity_px": run.network.max_disparity_px,
         "state": [dataclasses.asdict(tensor) for tensor in network.state_tensors],
-    }
-    if isinstance(network, RaftNetwork):
-        shared = out / f"{config.name}.weights"
-        export_stitched(network, paths, shared)
-        entry["weights"] = named(shared)
-    else:
-        for count, path in paths.items():
-            export_part(whole_step(network, count), path)
-    for count, path in paths.items():
-        worst = check_parity(network, count, path)
-        log.info("%s: 99 %% of pixels within %.1e px of PyTorch", path.name, worst)
-    if int8_clips is not None:
-        entry["int8"] = make_int8(
-            paths,
-            network.state_tensors,
-            int8_clips,
-            max_disparity_px=run.network.max_disparity_px,
-        )
-        log.info("int8: %s", entry["int8"])
-    entry |= {
-        "graphs": {str(count): named(path) for count, path in paths.items()},
         "architecture": dataclasses.asdict(run.network),
         "parameters": sum(p.numel() for p in network.parameters()),
         "training": run.story,
         "measured": run.measured,
     }
-    write_entry(out / MANIFEST_NAME, config.name, entry)
-
-
-def export_stitched(network: RaftNetwork, paths: Mapping[int, Path], weights: Path) -> None:
-    """Write a graph per iteration count to ``paths``, all beside one file of ``weights``.
-
-    One graph does what begin, iterate and end would do as graphs of their own, without handing
-    tensors from one to the next, and one call is simpler to serve. With the weights shared, five
-    counts take little more room than one. Of `fast` on two busy cores: 1.32 s against 1.41 s at
-    one iteration, 2.04 s against 2.41 s at five; 9.5 MB where five whole graphs would take 43.6
-    (``tests/benchmarks/graph_parts.py --model fast``).
-    """
-    parts = exported_parts(network)
-    models = {path: stitched(parts, count) for count, path in paths.items()}
-    write_with_shared_weights(models, weights)
-
-
-def exported_parts(network: RaftNetwork) -> Parts[onnx.ModelProto]:
-    """The graphs that :func:`stitched` takes, batch norms folded."""
-    models = []
     with TemporaryDirectory() as folder:
-        for part in parts_of(folded(network)):
+        write_model(Path(folder), config.name, models, parts, entry)
+        graphs = OnnxNetwork(Path(folder), config.name)
+        for count in models:
+            worst = check_parity(network, graphs, count)
+            log.info("%s, %d iterations: within %.1e px of PyTorch", config.name, count, worst)
+    if int8_clips is not None:
+        models, entry["int8"] = make_int8(
+            models,
+            network.state_tensors,
+            int8_clips,
+            max_disparity_px=run.network.max_disparity_px,
+        )
+        log.info("int8: %s", entry["int8"])
+    write_model(out, config.name, models, parts, entry)
+
+
+def write_model(
+    out: Path,
+    name: str,
+    models: Mapping[int, ModelProto],
+    parts: Parts[ModelProto],
+    entry: Mapping[str, object],
+) -> None:
+    """Write whole steps, by iteration count, as the files they are served from.
+
+    A step with one graph in ``begin`` stays whole: one call is simple to serve, and nothing is
+    handed from graph to graph. With the weights shared, five counts take little more room than one.
+    Of `fast` on two busy cores: 1.32 s against 1.41 s at one iteration, 2.04 s against 2.41 s at
+    five; 9.5 MB where five whole graphs would take 43.6 (``tests/benchmarks/graph_parts.py``).
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    if len(parts.begin) == 1:
+        files = {f"{name}_{count}.onnx": model for count, model in models.items()}
+        stages = {count: [[file]] for count, file in zip(models, files, strict=True)}
+        shared = out / f"{name}.weights"
+        write_with_shared_weights({out / file: model for file, model in files.items()}, shared)
+        written = [*files, shared.name]
+    else:
+        stages, files = in_stages(name, models, handed_on(parts))
+        for file, model in files.items():
+            onnx.save(model, out / file)
+        written = [*files]
+    digests = {file: hashlib.sha256((out / file).read_bytes()).hexdigest() for file in written}
+    graphs = {str(count): each for count, each in stages.items()}
+    write_entry(out / MANIFEST_NAME, name, {**entry, "graphs": graphs, "files": digests})
+
+
+def exported_parts(network: AnyNetwork) -> Parts[ModelProto]:
+    """The graphs that :func:`stitched` takes, batch norms folded."""
+    match folded(network):
+        case LiteNetwork() as lite:
+            parts = lite_parts_of(lite)
+        case RaftNetwork() as raft:
+            parts = raft_parts_of(raft)
+        case other:
+            raise ConfigError(f"no parts of a {type(other).__name__}")
+
+    def exported(part: Part) -> ModelProto:
+        with TemporaryDirectory() as folder:
             path = Path(folder) / "part.onnx"
             export_part(part, path)
-            models.append(onnx.load(path))
-    return Parts(*models)
+            return onnx.load(path)
 
-
-def named(path: Path) -> dict[str, str]:
-    """A file as the manifest names it."""
-    return {"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+    return Parts(
+        tuple(exported(part) for part in parts.begin),
+        exported(parts.iterate),
+        exported(parts.end),
+    )
 
 
 def write_entry(path: Path, name: str, entry: dict[str, object]) -> None:
     """Add or replace one model of the manifest."""
     manifest: dict[str, object] = {"format": MANIFEST_FORMAT, "models": {}}
     if path.exists():
-        manifest = json.loads(path.read_text("utf-8"))
+        before = json.loads(path.read_text("utf-8"))
+        # The entries of another format would be misread.
+        manifest = before if before["format"] == MANIFEST_FORMAT else manifest
     cast("dict[str, object]", manifest["models"])[name] = entry
     path.write_text(json.dumps(manifest, indent=1) + "\n", "utf-8")
 

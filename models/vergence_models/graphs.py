@@ -1,4 +1,4 @@
-"""From modules to ONNX graphs: a whole step at once, or parts of it to be stitched."""
+"""From modules to ONNX graphs: parts of a step, to be stitched."""
 
 from __future__ import annotations
 
@@ -64,26 +64,6 @@ def step_input_names(network: AnyNetwork) -> tuple[str, ...]:
 
 def step_output_names(network: AnyNetwork) -> tuple[str, ...]:
     return (DISPARITY, SIGMA, *(tensor.output_name for tensor in network.state_tensors))
-
-
-class WholeStep(nn.Module):
-    """The step with flat tensors in and out, in the order of the contract."""
-
-    def __init__(self, network: AnyNetwork, iterations: int) -> None:
-        super().__init__()
-        self.network = network
-        self.iterations = iterations
-
-    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        left, right, matrix, *state = inputs
-        estimate, following = self.network(left, right, matrix, tuple(state), self.iterations)
-        return estimate.disparity, estimate.sigma, *following
-
-
-def whole_step(network: AnyNetwork, iterations: int) -> Part:
-    inputs, sizes = step_inputs(network)
-    names = step_input_names(network), step_output_names(network)
-    return Part(WholeStep(network, iterations), inputs, sizes, *names)
 
 
 def export_part(part: Part, path: Path) -> None:

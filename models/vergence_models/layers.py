@@ -168,10 +168,10 @@ def silent(layer: nn.Conv2d) -> nn.Conv2d:
 class GatedCell(nn.Module):
     """A convolutional GRU cell: hidden [B, C, H, W] and inputs [B, I, H, W] to the next hidden."""
 
-    def __init__(self, hidden: int, inputs: int) -> None:
+    def __init__(self, hidden: int, inputs: int, *, kernel: int) -> None:
         super().__init__()
-        self.gates = conv(hidden + inputs, 2 * hidden)
-        self.candidate = conv(hidden + inputs, hidden)
+        self.gates = conv(hidden + inputs, 2 * hidden, kernel=kernel)
+        self.candidate = conv(hidden + inputs, hidden, kernel=kernel)
         nn.init.xavier_normal_(self.gates.weight)
         nn.init.xavier_normal_(self.candidate.weight)
         self.hidden = hidden

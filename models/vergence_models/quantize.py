@@ -2,7 +2,9 @@
 
 Activations are uint8; weights are int8, symmetric, with a scale per output channel: for this pair
 onnxruntime has its quickest kernels, three to four times as quick as float32. Sums of what
-convolutions gave stay bytes too. All else stays float32, so positions and disparities lose nothing.
+convolutions gave stay bytes too, and so does a product of features that is only looked up in: of
+the millions of its scores few are ever read. Images are bytes from the start, and sums of them
+are exact. All else stays float32, so positions and disparities lose nothing.
 """
 
 from __future__ import annotations
@@ -16,12 +18,16 @@ from onnx import ModelProto, NodeProto, TensorProto, helper, numpy_helper
 Array = NDArray[np.generic]
 
 # What passes its values on unchanged, and their scale with them.
-LAYOUT_OPS = frozenset({"Reshape", "Resize", "Squeeze", "Transpose", "Unsqueeze"})
+COPYING_OPS = frozenset(
+    {"Gather", "GatherElements", "Reshape", "Squeeze", "Transpose", "Unsqueeze"}
+)
+LAYOUT_OPS = COPYING_OPS | {"Resize"}
 # What bytes that start at 0 do by themselves. A clip's upper end is then the range's.
 ACTIVATIONS = frozenset({"Relu", "Clip"})
 # The quick kernel makes no fewer outputs; what was not asked for is cut off.
 KERNEL_OUTPUTS = 16
-# A convolution of an image would gain little, and its differences are what matching starts from.
+BYTES = ".bytes"  # behind a tensor's name: the same as bytes
+# A convolution of a gray image would gain little: its differences are what matching starts from.
 MIN_CHANNELS = 4
 
 
@@ -45,13 +51,15 @@ class Plan:
     """Which convolutions of a graph become int8, and which tensors bytes."""
 
     convolutions: frozenset[str]  # by the tensor that they give
+    products: frozenset[str]  # likewise, of matrices
+    images: dict[str, str]  # real image -> the bytes that it is
     source: dict[str, str]  # tensor -> the tensor that it has its scale from, itself mostly
     absorbed: dict[str, str]  # result of an activation -> what goes into it
 
     @property
     def measured(self) -> list[str]:
         """The tensors whose ranges have to be known."""
-        return sorted(set(self.source.values()))
+        return sorted(set(self.source.values()) - set(self.images))
 
 
 def with_weights_apart(model: ModelProto) -> ModelProto:
@@ -69,6 +77,9 @@ def with_weights_apart(model: ModelProto) -> ModelProto:
             for part, name in zip(parts, node.output, strict=True)
         )
         model.graph.node.remove(node)
+    read = {name for node in model.graph.node for name in node.input}
+    for tensor in [tensor for tensor in model.graph.initializer if tensor.name not in read]:
+        model.graph.initializer.remove(tensor)
     return model
 
 
@@ -90,28 +101,49 @@ def plan(model: ModelProto) -> Plan:
             result = following[0].output[0]
         source.setdefault(result, result)
 
-    convolutions = set()
+    def only_looked_up(name: str) -> bool:
+        return all(
+            reader.op_type in ("GatherElements", "Shape")
+            or (reader.op_type in COPYING_OPS and only_looked_up(reader.output[0]))
+            for reader in readers.get(name, [])
+        )
+
+    convolutions, products = set(), set()
+    images: dict[str, str] = {}
+    of_bytes = {
+        entry.name
+        for entry in model.graph.input
+        if entry.type.tensor_type.elem_type == TensorProto.UINT8
+    }
     for node in model.graph.node:  # in the order they run in
         result = node.output[0]
         if node.op_type == "Conv" and node.input[1] in constants:
-            if constants[node.input[1]].dims[1] < MIN_CHANNELS:
+            few = constants[node.input[1]].dims[1] < MIN_CHANNELS
+            if few and node.input[0] not in images:
                 continue
             convolutions.add(result)
             source.setdefault(node.input[0], node.input[0])
             give_bytes(result)
+        elif node.op_type == "MatMul" and result in readers and only_looked_up(result):
+            products.add(result)
+            source.update((name, name) for name in (*node.input, result) if name not in source)
         elif node.op_type == "Add" and all(name in source for name in node.input):
             give_bytes(result)
         elif node.op_type in LAYOUT_OPS and node.input[0] in source:
             source[result] = source[node.input[0]]
-    # What is put together for a convolution alone is put together as bytes.
+        elif node.op_type in (*COPYING_OPS, "Slice") and node.input[0] in of_bytes:
+            of_bytes.add(result)
+        elif node.op_type == "Cast" and node.input[0] in of_bytes:
+            images[result] = node.input[0]
+    # What is copied or put together for such an operator alone is so as bytes.
     made_by = {name: node for node in model.graph.node for name in node.output}
     for node in reversed(model.graph.node):
         whole, result = node.input[0] if node.input else "", node.output[0]
         if node.op_type not in LAYOUT_OPS or result not in source or len(readers[whole]) > 1:
             continue
-        if whole in made_by and made_by[whole].op_type == "Concat":
+        if node.op_type in COPYING_OPS or (whole in made_by and made_by[whole].op_type == "Concat"):
             source.setdefault(whole, source[result])
-    return Plan(frozenset(convolutions), source, absorbed)
+    return Plan(frozenset(convolutions), frozenset(products), images, source, absorbed)
 
 
 def quantized(model: ModelProto, what: Plan, scales: dict[str, Scale]) -> ModelProto:
@@ -133,12 +165,14 @@ class _Writer:
     def __init__(self, model: ModelProto, what: Plan, scales: dict[str, Scale]) -> None:
         self._model = model
         self._plan = what
+        scales = {**scales, **dict.fromkeys(what.images, Scale(np.float32(1), np.uint8(0)))}
         self._scales = {name: scales[source] for name, source in what.source.items()}
         self._old = {tensor.name: tensor for tensor in model.graph.initializer}
         self._outputs = {output.name for output in model.graph.output}
         self._new: dict[str, TensorProto] = {}
         self._nodes: list[NodeProto] = []
         self._reading: dict[str, str] = {}  # tensor -> what its readers read instead
+        self._as_bytes: set[str] = set()  # tensors all of which there is as NAME.bytes
         self._asked: dict[str, int] = {}  # result of a widened convolution -> channels asked for
 
     def send_as_bytes(self, name: str) -> None:
@@ -148,7 +182,9 @@ class _Writer:
         real = self._plan.absorbed.get(name, name)
         # The contract's outputs keep their name, and what they were before the bytes.
         reading = self._through_bytes(real, name, name)
-        if real in self._asked:
+        if real not in self._asked:
+            self._as_bytes.add(name)
+        else:
             ends = {"start": [0], "end": [self._asked[real]], "axis": [1]}
             cut = [self._constant(f"{name}.{end}", np.array(ends[end], np.int64)) for end in ends]
             reading = self._add("Slice", [reading, *cut], f"{name}.asked")
@@ -160,6 +196,13 @@ class _Writer:
         result = node.output[0]
         if result in self._plan.convolutions:
             inputs[1:] = self._weights(node)
+        elif result in self._plan.images and result in self._scales:
+            self._add("Identity", inputs, result + BYTES)
+            self._read_bytes(result)
+            return
+        elif node.op_type == "MatMul" and self._sums_bytes(node):
+            self._add_integer_product(node)
+            return
         elif node.op_type == "Concat" and result in self._scales:
             inputs = [
                 each
@@ -169,6 +212,18 @@ class _Writer:
             ]
         elif node.op_type == "Resize" and node.input[0] in self._scales and self._doubles(node):
             self._add_doubled(node.input[0], result)
+            return
+        elif node.op_type == "Shape" and node.input[0] in self._as_bytes:
+            inputs[0] = node.input[0] + BYTES
+        elif (
+            node.op_type in COPYING_OPS
+            and node.input[0] in self._as_bytes
+            and result not in self._outputs
+        ):
+            copied.input[:] = [node.input[0] + BYTES, *inputs[1:]]
+            copied.output[:] = [result + BYTES]
+            self._nodes.append(copied)
+            self._read_bytes(result)
             return
         del copied.input[:]
         copied.input.extend(inputs)
@@ -186,8 +241,8 @@ class _Writer:
     def _through_bytes(self, real: str, name: str, like: str) -> str:
         """``real`` as bytes of the scale of ``like``, and what is real again of that."""
         by = self._scale(like)
-        self._add("QuantizeLinear", [real, *by], f"{name}.bytes")
-        return self._add("DequantizeLinear", [f"{name}.bytes", *by], f"{name}.real")
+        self._add("QuantizeLinear", [real, *by], name + BYTES)
+        return self._add("DequantizeLinear", [name + BYTES, *by], f"{name}.real")
 
     def _scale(self, name: str) -> list[str]:
         scale = self._scales[name]
@@ -213,18 +268,36 @@ class _Writer:
         """Twice the size by copies of bytes, channels last: first of columns, then of rows."""
         twice = self._constant("twice", np.array([1, 2, 2, 1], np.int64))
         rows = self._constant("rows", np.array([0, 0, -1], np.int64))
-        cells = self._add("Transpose", [f"{name}.bytes"], f"{result}.cells", perm=[0, 2, 3, 1])
+        cells = self._add("Transpose", [name + BYTES], f"{result}.cells", perm=[0, 2, 3, 1])
         shape = self._add("Shape", [cells], f"{result}.half")
         shape = self._add("Mul", [shape, twice], f"{result}.shape")
         wide = self._add("Concat", [cells, cells], f"{result}.pairs", axis=3)
         wide = self._add("Reshape", [wide, rows], f"{result}.rows")
         high = self._add("Concat", [wide, wide], f"{result}.blocks", axis=2)
         high = self._add("Reshape", [high, shape], f"{result}.last")
-        self._add("Transpose", [high], f"{result}.bytes", perm=[0, 3, 1, 2])
-        by = self._scale(result)
-        self._reading[result] = self._add(
-            "DequantizeLinear", [f"{result}.bytes", *by], f"{result}.real"
-        )
+        self._add("Transpose", [high], result + BYTES, perm=[0, 3, 1, 2])
+        self._read_bytes(result)
+
+    def _read_bytes(self, result: str) -> None:
+        """Have the readers of ``result`` read what its bytes, which there are, stand for."""
+        inputs = [result + BYTES, *self._scale(result)]
+        self._reading[result] = self._add("DequantizeLinear", inputs, f"{result}.real")
+        self._as_bytes.add(result)
+
+    def _sums_bytes(self, node: NodeProto) -> bool:
+        """Whether it multiplies an image with whole numbers that fit into bytes."""
+        image, weight = node.input
+        if image not in self._plan.images or weight not in self._old:
+            return False
+        values = numpy_helper.to_array(self._old[weight])
+        return bool((values == np.rint(values)).all() and np.abs(values).max() <= 127)
+
+    def _add_integer_product(self, node: NodeProto) -> None:
+        image, weight = node.input
+        values = numpy_helper.to_array(self._old[weight]).astype(np.int8)
+        inputs = [self._plan.images[image], self._constant(weight + BYTES, values)]
+        whole = self._add("MatMulInteger", inputs, f"{node.output[0]}.whole")
+        self._add("Cast", [whole], node.output[0], to=TensorProto.FLOAT)
 
     def _weights(self, node: NodeProto) -> list[str]:
         """Weight and bias of a convolution as int8 and int32."""

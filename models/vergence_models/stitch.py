@@ -1,4 +1,4 @@
-"""Graphs of any iteration count, stitched from three: before the iterations, one, and after.
+"""Graphs of any iteration count, stitched from parts: before the iterations, one, and after.
 
 Each part goes through the exporter once, whatever the counts; and graphs of all counts hold the
 same weights, so those go into one file beside them.
@@ -16,15 +16,16 @@ from onnx import ModelProto, NodeProto, TensorProto
 T = TypeVar("T")
 SMALL_BYTES = 1024  # such tensors stay in the graph: shapes and scalars that runtimes fold
 ALIGNMENT = 4096  # runtimes map whole pages
+TAKES_PLACE = "to_"
 
 
 class Parts(NamedTuple, Generic[T]):
-    """``begin`` hands its outputs to ``iterate`` and ``end``, which find them by name.
+    """What is found before the iterations, by graphs that do not need each other; one; the rest.
 
-    The outputs of ``iterate`` take the place of its last inputs, in their order.
+    Outputs are found by name. One of ``iterate`` that is called to_NAME takes the place of NAME.
     """
 
-    begin: T
+    begin: tuple[T, ...]
     iterate: T
     end: T
 
@@ -32,29 +33,28 @@ class Parts(NamedTuple, Generic[T]):
 def stitched(parts: Parts[ModelProto], iterations: int) -> ModelProto:
     """One graph: inputs of ``begin``, outputs of ``end``, and ``iterations`` times between."""
     model = ModelProto()
-    model.CopyFrom(parts.begin)
+    model.CopyFrom(parts.begin[0])
     graph = model.graph
     for field in (graph.node, graph.initializer, graph.output):
         del field[:]
-    known: dict[str, str] = {entry.name: entry.name for entry in parts.begin.graph.input}
-    steps = [("begin", parts.begin, "begin")]
-    steps += [("iterate", parts.iterate, f"iterate_{number}") for number in range(iterations)]
-    steps += [("end", parts.end, "end")]
-    for part, source, label in steps:
+    known: dict[str, str] = {entry.name: entry.name for entry in graph.input}
+    steps = [(f"begin_{number}", part, 0) for number, part in enumerate(parts.begin)]
+    steps += [("iterate", parts.iterate, number) for number in range(iterations)]
+    steps += [("end", parts.end, 0)]
+    for name, part, number in steps:
         # Weights are named after their part, what is computed after the place it is computed at.
-        names = {entry.name: known[entry.name] for entry in source.graph.input}
-        names |= {entry.name: f"{part}.{entry.name}" for entry in source.graph.initializer}
-        for node in source.graph.node:
-            names |= {name: f"{label}.{name}" for name in node.output if name}
-        if part == "end":
-            names |= {entry.name: entry.name for entry in source.graph.output}
-        graph.node.extend(renamed(node, names, label) for node in source.graph.node)
-        if label in ("begin", "iterate_0", "end"):
-            graph.initializer.extend(relabelled(entry, names) for entry in source.graph.initializer)
-        outputs = [entry.name for entry in source.graph.output]
-        places = [entry.name for entry in source.graph.input][-len(outputs) :]
-        handed = zip(places if part == "iterate" else outputs, outputs, strict=True)
-        known |= {place: names[output] for place, output in handed}
+        place = f"{name}_{number}" if part is parts.iterate else name
+        names = {entry.name: known[entry.name] for entry in part.graph.input}
+        names |= {entry.name: f"{name}.{entry.name}" for entry in part.graph.initializer}
+        for node in part.graph.node:
+            names |= {result: f"{place}.{result}" for result in node.output if result}
+        if part is parts.end:
+            names |= {entry.name: entry.name for entry in part.graph.output}
+        graph.node.extend(renamed(node, names, place) for node in part.graph.node)
+        if number == 0:
+            graph.initializer.extend(relabelled(entry, names) for entry in part.graph.initializer)
+        results = [entry.name for entry in part.graph.output]
+        known |= {result.removeprefix(TAKES_PLACE): names[result] for result in results}
     graph.output.extend(parts.end.graph.output)
     return model
 

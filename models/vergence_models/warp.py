@@ -6,6 +6,7 @@ pixel centres at integers. A 4x4 matrix takes the previous frame's to the curren
 
 from __future__ import annotations
 
+import functools
 import itertools
 
 import torch
@@ -71,30 +72,36 @@ def fill_cracks(d: Tensor) -> Tensor:
     return torch.where((filled < 0.5) & (both[:, 1] > 0.5), mean, d)
 
 
-def sample_nearest(features: Tensor, column: Tensor, row: Tensor) -> Tensor:
-    """Rows of ``features`` [B, C, H, W] at float cells [B, H', W'], clamped: [B, C, H', W']."""
-    batch, channels, height, width = features.shape
-    x = torch.floor(column + 0.5).clamp(0, width - 1)
-    y = torch.floor(row + 0.5).clamp(0, height - 1)
-    index = (y * width + x).long().flatten(1)[:, None].expand(-1, channels, -1)
-    picked = features.flatten(2).gather(2, index)
-    return picked.view(batch, channels, column.shape[1], column.shape[2])
-
-
 def sample_bilinear(features: Tensor, column: Tensor, row: Tensor) -> Tensor:
     """Bilinear samples of ``features`` [B, C, H, W] at float cells [B, H', W'], clamped.
 
     Four gathers instead of grid_sample, which is thirty times slower under onnxruntime.
     """
-    height, width = features.shape[2:]
+    batch, channels, height, width = features.shape
     x = column.clamp(0, width - 1)
     y = row.clamp(0, height - 1)
     x0, y0 = torch.floor(x), torch.floor(y)
-    fx, fy = (x - x0)[:, None], (y - y0)[:, None]
-    top = sample_nearest(features, x0, y0) * (1 - fx) + sample_nearest(features, x0 + 1, y0) * fx
-    low = sample_nearest(features, x0, y0 + 1) * (1 - fx)
-    low = low + sample_nearest(features, x0 + 1, y0 + 1) * fx
-    return top * (1 - fy) + low * fy
+    rows = features.flatten(2).transpose(1, 2)  # the channels of a cell side by side
+    terms = []
+    for dy, dx in itertools.product((0, 1), repeat=2):
+        share = (1 - (x - x0 - dx).abs()) * (1 - (y - y0 - dy).abs())
+        cell = (y0 + dy).clamp(max=height - 1) * width + (x0 + dx).clamp(max=width - 1)
+        terms.append(rows_at(rows, cell.flatten(1).long()) * share.flatten(1)[:, :, None])
+    sampled = functools.reduce(torch.add, terms)
+    return sampled.transpose(1, 2).view(batch, channels, column.shape[1], column.shape[2])
+
+
+def rows_at(rows: Tensor, index: Tensor) -> Tensor:
+    """Those of ``rows`` [B, N, C] with an ``index`` [B, M]: [B, M, C].
+
+    onnxruntime gathers single elements quickest one by one, and more of them as slices.
+    """
+    batch, count, channels = rows.shape
+    if channels == 1:
+        return rows.gather(1, index[:, :, None])
+    first = torch.arange(batch, device=rows.device)[:, None] * count
+    picked = rows.reshape(batch * count, channels).index_select(0, (index + first).flatten())
+    return picked.view(batch, index.shape[1], channels)
 
 
 def splat_softmax(values: Tensor, column: Tensor, row: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""One graph per iteration count against three graphs run in turn: a step of full or fast.
+"""One graph per iteration count against its parts run in turn: a step of full or fast.
 
     python tests/benchmarks/graph_parts.py --model fast --json FILE
 
@@ -18,14 +18,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-import onnx
 import onnxruntime
 from numpy.typing import NDArray
 
 from vergence_models.config import RaftNetworkConfig, load_config
 from vergence_models.export import exported_parts
 from vergence_models.raft.network import RaftNetwork
-from vergence_models.stitch import Parts, stitched, write_with_shared_weights
+from vergence_models.stitch import TAKES_PLACE, Parts, stitched, write_with_shared_weights
 from vergence_proto.model_io import LEFT, RIGHT, UVD_CURR_FROM_PREV
 
 HEIGHT, WIDTH = 480, 640
@@ -34,21 +33,19 @@ MEASURED = (1, 5)
 Feed = dict[str, NDArray[np.generic]]
 
 
-def session_of(path: Path, threads: int) -> onnxruntime.InferenceSession:
+def session_of(graph: Path | bytes, threads: int) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
-    return onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    return onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
 
 
 def in_turn(sessions: Parts[onnxruntime.InferenceSession], feed: Feed, count: int) -> None:
-    """A step by three graphs: what one hands over is the next one's input."""
-    names = [output.name for output in sessions.begin.get_outputs()]
-    tensors = dict(zip(names, sessions.begin.run(None, feed), strict=True))
-    moving = names[-len(sessions.iterate.get_outputs()) :]
-    for _ in range(count):
-        tensors |= zip(moving, sessions.iterate.run(None, tensors), strict=True)
-    wanted = {entry.name for entry in sessions.end.get_inputs()}
-    sessions.end.run(None, {name: value for name, value in tensors.items() if name in wanted})
+    """A step by its parts: what one hands over is an input of those that follow."""
+    tensors = dict(feed)
+    for session in (*sessions.begin, *([sessions.iterate] * count), sessions.end):
+        given = {entry.name: tensors[entry.name] for entry in session.get_inputs()}
+        names = [entry.name.removeprefix(TAKES_PLACE) for entry in session.get_outputs()]
+        tensors |= zip(names, session.run(None, given), strict=True)
 
 
 def measure(methods: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
@@ -77,15 +74,16 @@ def main() -> None:
     parts = exported_parts(network)
     with TemporaryDirectory() as folder:
         out = Path(folder)
-        apart = [out / f"{name}.onnx" for name in Parts._fields]
-        for part, path in zip(parts, apart, strict=True):
-            onnx.save(part, path)
         paths = {count: out / f"step_{count}.onnx" for count in COUNTS}
         models = {path: stitched(parts, count) for count, path in paths.items()}
         whole = sum(model.ByteSize() for model in models.values())
         write_with_shared_weights(models, out / "weights")
         shared = sum(path.stat().st_size for path in (*paths.values(), out / "weights"))
-        sessions = Parts(*(session_of(path, given.threads) for path in apart))
+        begin, *rest = (
+            session_of(part.SerializeToString(), given.threads)
+            for part in (*parts.begin, parts.iterate, parts.end)
+        )
+        sessions = Parts((begin,), *rest)
         fused = {count: session_of(paths[count], given.threads) for count in MEASURED}
         images = np.random.default_rng(0).integers(0, 256, (2, 1, HEIGHT, WIDTH, 3), np.uint8)
         feed: Feed = {

@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 from torch import nn
 
 from tests.models.trained import as_trained
-from vergence_models.config import LiteNetworkConfig
+from vergence_models.config import Config, LiteNetworkConfig
 from vergence_models.evaluate import WEIGHTS
-from vergence_models.export import PARITY_PX, check_parity, shifted_pair
-from vergence_models.graphs import COLUMNS, Part, export_part, whole_step
+from vergence_models.export import PARITY_PX, check_parity, export_run, shifted_pair
+from vergence_models.graphs import COLUMNS, Part, export_part
 from vergence_models.layers import all_pairs, banded, best_rival, lookup_row
 from vergence_models.lite.network import LiteNetwork, LiteState
+from vergence_models.runs import Run
 from vergence_models.stepping import OnnxNetwork
 
 HEIGHT, WIDTH = 192, 256
@@ -62,9 +63,14 @@ def test_the_graph_equals_pytorch_frame_by_frame(
 ) -> None:
     # Under pytest's capture the tracer would format every symbolic shape it meets: minutes of it.
     monkeypatch.setattr(logging.getLogger("torch.__trace"), "propagate", False)
-    path = tmp_path / "lite_2.onnx"
-    export_part(whole_step(network, 2), path)
-    assert check_parity(network, 2, path, frames=4) < PARITY_PX
+    run = Run("lite", network.config, network.state_dict(), story={}, measured={})
+    export_run(run, Config("lite", network.config, iterations=(1, 2)), tmp_path)
+    graphs = OnnxNetwork(tmp_path, "lite")
+    for count in (1, 2):
+        assert check_parity(network, graphs, count, frames=4) < PARITY_PX
+    # Both counts begin with the same two graphs.
+    assert graphs.card.graphs[1][0] == graphs.card.graphs[2][0]
+    assert len(graphs.card.graphs[1][0]) == 2
 
 
 def test_a_second_iteration_is_a_second_look_at_the_same_frame(network: LiteNetwork) -> None:

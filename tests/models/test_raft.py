@@ -19,6 +19,7 @@ from vergence_models.raft.network import RaftNetwork, RaftState
 from vergence_models.raft.parts import parts_of
 from vergence_models.raft.update import looked_up, pyramid
 from vergence_models.runs import Run
+from vergence_models.stepping import OnnxNetwork
 from vergence_proto.model_io import ManifestError, load_model_card
 
 HEIGHT, WIDTH = 96, 224
@@ -67,8 +68,9 @@ def test_exported_graphs_equal_pytorch_and_share_their_weights(tmp_path: Path) -
     card = load_model_card(tmp_path, "full")
     assert card.state == network.state_tensors
     weights = tmp_path / "full.weights"
-    for count, path in card.graphs.items():
-        assert check_parity(network, count, path, frames=4) < PARITY_PX
+    graphs = OnnxNetwork(tmp_path, "full")
+    for count, ((path,),) in card.graphs.items():
+        assert check_parity(network, graphs, count, frames=4) < PARITY_PX
         kinds = {node.op_type for node in onnx.load(path, load_external_data=False).graph.node}
         assert not kinds & {"BatchNormalization", "Loop", "If"}
     stored = sum(p.numel() * 4 for p in folded(network).parameters())
@@ -85,7 +87,7 @@ def test_exported_graphs_equal_pytorch_and_share_their_weights(tmp_path: Path) -
 def test_the_exported_beginning_without_a_warp_equals_pytorch(tmp_path: Path) -> None:
     """Of `fast`. What follows it is the code of `full`, to the last operation."""
     network = folded(tiny_network(warp=False))
-    begin, path = parts_of(network).begin, tmp_path / "begin.onnx"
+    (begin,), path = parts_of(network).begin, tmp_path / "begin.onnx"
     export_part(begin, path)
     moved = torch.eye(4).repeat(2, 1, 1)
     moved[1, 0, 3] = 9.0

@@ -7,11 +7,11 @@ import torch
 
 from vergence_models.layers import all_pairs, conv, joint
 from vergence_models.lite.volume import (
+    Near,
     Volume,
     gathered,
     lookup,
     lookup_row,
-    near_pairs,
     whole_rows,
 )
 
@@ -20,7 +20,8 @@ from vergence_models.lite.volume import (
 def test_near_pairs_are_those_of_all_pairs_within_reach(ratio: int) -> None:
     reach, margin, width = 12, 3, 32
     left, right = torch.randn(2, 4, 6, width), torch.randn(2, 4, 6, ratio * width)
-    near, everything = near_pairs(left, right, reach=reach, margin=margin), all_pairs(left, right)
+    columns, everything = Near(ratio, reach, margin), all_pairs(left, right)
+    near = columns.volume(columns.pairs(left, right))
     x = torch.arange(width).expand(2, 1, 6, width)
     for offset in range(-reach - margin, margin + 1):
         entry = ratio * x + offset
@@ -33,7 +34,7 @@ def test_near_pairs_are_those_of_all_pairs_within_reach(ratio: int) -> None:
 def squares(first: float = 0.0) -> Volume:
     """Of a row of eight squares, all of it or what is left of it from ``first`` on."""
     row = torch.arange(8.0)[int(first) :].view(1, 1, 1, -1) ** 2
-    return Volume(row, torch.tensor([first]), 7)
+    return Volume(row, torch.zeros(1), torch.tensor([first]), 1, row.shape[-1], 7)
 
 
 @pytest.mark.parametrize("first", [0.0, 2.0])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -27,6 +29,13 @@ CELL_INPUTS = TAPS + 9  # what the cell sees besides the context
 MIN_PX = 0.1  # no answer is nearer to infinity
 
 
+class Clues(NamedTuple):
+    """What the scores of the wide search are made of, as far as two images alone say it."""
+
+    fixed: Tensor  # [B, D, H, W] at 1/8, largest disparity first: scores before anything learned
+    features: Tensor  # [B, D, C, H/2, W/2]: what the learned filter sees of them
+
+
 class CostFilter(nn.Module):
     """Coarse scores from the raw volume.
 
@@ -43,15 +52,16 @@ class CostFilter(nn.Module):
         width = config.cost_channels
         self.sharpness = nn.Parameter(torch.tensor([6.0, 8.0, 10.0]))
         self.mutual = nn.Parameter(torch.tensor(0.3))
-        self.enter = conv(9, width, stride=2)
+        self.enter = nn.Conv2d(4, width, 2, stride=2)
+        self.expected = conv(4, width, kernel=1)
         self.context = conv(config.context_low, width, kernel=1)
         self.down = conv(width, width, stride=2)
         self.low = conv(width, width)
-        self.middle = conv(width, width)
+        self.middle = conv(width, width, kernel=1)
         self.leave = silent(conv(width, 4, kernel=1))
 
-    def forward(self, volume: Tensor, context: Tensor, prior: Tensor) -> Tensor:
-        """``volume`` [B, H, W, D] at 1/8, ``context`` at 1/16, ``prior`` [B, 1, H, W] px or 0."""
+    def clues(self, volume: Tensor) -> Clues:
+        """``volume`` [B, H, W, D] at 1/8."""
         batch, height, width, bins = volume.shape
         narrow = volume.permute(0, 3, 1, 2)
         middle = box3(narrow)
@@ -59,33 +69,32 @@ class CostFilter(nn.Module):
         fixed = narrow * self.sharpness[0] + middle * self.sharpness[1] + wide * self.sharpness[2]
         lead = (fixed - fixed.amax(dim=1, keepdim=True)) * 0.1
         claim = (fixed - best_rival(fixed, 2)).clamp(max=0) * 0.1
-        bin_px = torch.arange(bins - 1, -1, -1, device=volume.device).to(volume.dtype) * BIN_PX
-        bin_px = bin_px[None, :, None, None]
-        # Where nothing is expected, nothing is near.
-        expected_px = prior - (prior <= 0).to(volume.dtype) * 1e3
-        near = (1 - (expected_px * (0.5 / BIN_PX) - bin_px * (0.5 / BIN_PX)).abs()).clamp(min=0)
-        u, _ = cell_centres(height, width, 8, volume)
-        in_view = (bin_px <= u).to(volume.dtype).expand_as(narrow)
-        sides = F.pad(middle, (0, 0, 0, 0, 1, 1))
-        channels = (
-            narrow,
-            middle,
-            wide,
-            lead.clamp(min=-1),
-            near,
-            sides[:, :-2],
-            sides[:, 2:],
-            claim.clamp(min=-1),
-            in_view,
-        )
+        channels = (narrow, middle, lead.clamp(min=-1), claim.clamp(min=-1))
         stacked = torch.stack(channels, dim=2)
-        x = self.enter(stacked.reshape(batch * bins, len(channels), height, width))
-        x = x.view(batch, bins, -1, height // 2, width // 2) + self.context(context)[:, None]
+        features = self.enter(stacked.reshape(batch * bins, len(channels), height, width))
+        features = features.view(batch, bins, -1, height // 2, width // 2)
+        return Clues(fixed + 10 * self.mutual * claim, features)
+
+    def forward(self, clues: Clues, context: Tensor, prior: Tensor) -> Tensor:
+        """Scores [B, H, W, D]; ``context`` [B, C, H/2, W/2], ``prior`` [B, 1, H, W] px or 0."""
+        batch, bins, height, width = clues.fixed.shape
+        # Where nothing is expected, nothing is near.
+        expected_px = F.pixel_unshuffle(prior - (prior <= 0).to(prior.dtype) * 1e3, 2)
+        bin_px = disparities(bins, prior)[:, :, None]
+        near = (1 - (expected_px[:, None] - bin_px).abs() * (0.5 / BIN_PX)).clamp(min=0)
+        near = self.expected(near.view(batch * bins, 4, height // 2, width // 2))
+        x = clues.features + near.view_as(clues.features) + context[:, None]
         x = F.relu6(x).view(batch * bins, -1, height // 2, width // 2)
         low = F.relu6(self.low(F.relu6(self.down(x))))
         x = F.relu6(self.middle(x + enlarge(low)))
         residual = F.pixel_shuffle(self.leave(x), 2).view(batch, bins, height, width)
-        return (fixed + 10 * self.mutual * claim + residual).permute(0, 2, 3, 1)
+        return (clues.fixed + residual).permute(0, 2, 3, 1)
+
+
+def disparities(bins: int, like: Tensor) -> Tensor:
+    """Those that the coarse scores stand for, px, [1, D, 1, 1]."""
+    px = torch.arange(bins - 1, -1, -1, device=like.device).to(like.dtype) * BIN_PX
+    return px[None, :, None, None]
 
 
 def coarse_position(d: Tensor, last: int) -> Tensor:
@@ -150,8 +159,8 @@ class CoarseUpdate(nn.Module):
 
     def __init__(self, config: LiteNetworkConfig) -> None:
         super().__init__()
-        self.cell = GatedCell(config.hidden, 64 - config.hidden)
-        self.head = conv(config.hidden, config.hidden)
+        self.cell = GatedCell(config.hidden, 64 - config.hidden, kernel=1)
+        self.head = conv(config.hidden, config.hidden, kernel=1)
         self.out = silent(conv(config.hidden, 5, kernel=1))
 
     def forward(
@@ -178,9 +187,7 @@ class CoarseUpdate(nn.Module):
                 context,
                 log_p * 0.1,
                 guess_log,
-                squash(guess_px - d, 2.0),
-                squash(fill - d, 2.0),
-                squash(far - d, 2.0),
+                squash(torch.cat((guess_px, fills), dim=1) - d, 2.0),
                 hole,
                 d * (1 / 64),
                 beyond(d, scale=8),

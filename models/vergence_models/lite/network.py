@@ -24,6 +24,7 @@ from vergence_models.config import LiteNetworkConfig
 from vergence_models.layers import CensusDescriptor, added, all_pairs, banded
 from vergence_models.lite.coarse import (
     BIN_PX,
+    Clues,
     CoarseUpdate,
     CostFilter,
     far_fill,
@@ -33,8 +34,8 @@ from vergence_models.lite.coarse import (
 from vergence_models.lite.context import Context
 from vergence_models.lite.hypotheses import Hypotheses
 from vergence_models.lite.losses import search_cross_entropy
-from vergence_models.lite.refinement import FINE_PX, REACH, Refined, Refinement
-from vergence_models.lite.volume import Volume, near_pairs, whole_rows
+from vergence_models.lite.refinement import Refined, Refinement, near_columns
+from vergence_models.lite.volume import whole_rows
 from vergence_models.losses import known, masked_mean, output_loss, robust
 from vergence_models.network import Estimate, State, StereoNetwork
 from vergence_models.warp import warp_state
@@ -51,11 +52,11 @@ class LiteState(NamedTuple):
 class Evidence(NamedTuple):
     """What two images say by themselves: made once, whatever the iterations."""
 
-    fine: Volume  # at 1/4
-    coarse: Tensor  # [B, H/8, W/8, D]: correlation, largest disparity first
+    clues: Clues
+    pairs: Tensor  # [B, H/4, W/4, N]: correlation at 1/4
     context4: Tensor  # [B, C, H/4, W/4]
     context8: Tensor
-    context16: Tensor
+    context16: Tensor  # as the cost filter takes it
 
 
 class Guess(NamedTuple):
@@ -108,6 +109,7 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         self.cost_filter = CostFilter(config)
         self.update = CoarseUpdate(config)
         self.refinement = Refinement(config)
+        self.near = near_columns(config.max_disparity_px)
 
     @property
     def state_tensors(self) -> tuple[StateTensor, ...]:
@@ -122,9 +124,7 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         iterations: int,
     ) -> tuple[LiteEstimate, LiteState]:
         evidence = self.search(left, right)
-        disparity, hidden = LiteState(*state)
-        moved = warp_state(disparity, hidden, uvd_curr_from_prev, scale=4, hidden_scale=8)
-        following = LiteState(*moved)
+        following = self.moved(LiteState(*state), uvd_curr_from_prev)
         guesses: list[Guess] = []
         for _ in range(iterations):
             found = self.iterate(evidence, following)
@@ -133,20 +133,28 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         disparity, sigma = self.refinement.enlarged(found.answer)
         return LiteEstimate(disparity, sigma, found.scores, guesses), following
 
+    def moved(self, state: LiteState, uvd_curr_from_prev: Tensor) -> LiteState:
+        """The state of the previous frame in the view of this one."""
+        return LiteState(*warp_state(*state, uvd_curr_from_prev, scale=4, hidden_scale=8))
+
     def search(self, left: Tensor, right: Tensor) -> Evidence:
         """What the images say by themselves; [B, H, W, 3] uint8 each."""
-        left_rows, right_rows = interleave(left), interleave(right)
-        left_half, right_half = half_gray(left_rows), half_gray(right_rows)
-        left_fine = self.fine_descriptor(left_half, 2)
-        right_fine = self.fine_descriptor(right_half, 1)
-        reach = self.config.max_disparity_px // FINE_PX
-        fine = near_pairs(left_fine, right_fine, reach=reach, margin=REACH + 2)
+        return Evidence(self.search_wide(left, right), *self.search_narrow(left, right))
+
+    def search_wide(self, left: Tensor, right: Tensor) -> Clues:
+        """All disparities, at 1/8."""
         pairs = all_pairs(
-            self.coarse_descriptor(F.avg_pool2d(left_half, 2), 2),
-            self.coarse_descriptor(F.avg_pool2d(right_half, 2), 1),
+            self.coarse_descriptor(gray(left, 4), 2), self.coarse_descriptor(gray(right, 4), 1)
         )
-        coarse = banded(pairs, self.config.max_disparity_px // BIN_PX)
-        return Evidence(fine, coarse, *self.context(left_rows))
+        return self.cost_filter.clues(banded(pairs, self.config.max_disparity_px // BIN_PX))
+
+    def search_narrow(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Pairs at 1/4, and the context: what :class:`Evidence` holds besides the clues."""
+        left_fine = self.fine_descriptor(gray(left, 2), 2)
+        right_fine = self.fine_descriptor(gray(right, 2), 1)
+        quarter, eighth, sixteenth = self.context(left)
+        pairs = self.near.pairs(left_fine, right_fine)
+        return pairs, quarter, eighth, self.cost_filter.context(sixteenth)
 
     def iterate(self, evidence: Evidence, state: LiteState) -> Iteration:
         """From the surface that is expected to a better one, by both searches."""
@@ -155,7 +163,7 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         seen8 = F.avg_pool2d(seen, 2)
         hole8 = (seen8 <= 0).to(prior.dtype)
         prior8 = F.avg_pool2d(prior, 2) / seen8.clamp(min=0.1)
-        scores = whole_rows(self.cost_filter(evidence.coarse, evidence.context16, prior8))
+        scores = whole_rows(self.cost_filter(evidence.clues, evidence.context16, prior8))
         guess = peak(scores)
         confidence = torch.exp(4 * guess[1])
         fill = smooth_fill(guess[0], confidence)
@@ -170,17 +178,19 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
             scores=scores,
             context=evidence.context8,
         )
-        answer = self.refinement(evidence.fine, d, hidden, prior, evidence.context4)
-        guesses = Guess(d, hypotheses, 8), Guess(answer.disparity, answer.hypotheses, 4)
+        pairs = self.near.volume(evidence.pairs)
+        answer, chosen_among = self.refinement(pairs, d, hidden, prior, evidence.context4)
+        guesses = Guess(d, hypotheses, 8), Guess(answer.disparity, chosen_among, 4)
         return Iteration(answer, hidden, scores.scores, guesses)
 
 
-def interleave(image: Tensor) -> Tensor:
-    """uint8 [B, H, W, 3] as float [B, 1, H, 3 W]."""
+def gray(image: Tensor, scale: int) -> Tensor:
+    """Mean of the colours of blocks of pixels: uint8 [B, H, W, 3] to [B, 1, H/scale, W/scale].
+
+    Two rows speak for a block. Their sums are a product with ones: of bytes, that is quick.
+    """
     batch, height, width, _ = image.shape
-    return image.reshape(batch, 1, height, 3 * width).float()
-
-
-def half_gray(rows: Tensor) -> Tensor:
-    """Mean of the colours of 2x2 pixels: [B, 1, H, 3 W] to [B, 1, H/2, W/2] in 0..255."""
-    return F.avg_pool2d(rows, (2, 6))
+    ones = torch.eye(32 // scale, device=image.device).repeat_interleave(3 * scale, dim=0)
+    rows = image[:, :: scale // 2].reshape(-1, 96)  # widths are multiples of 32
+    sums = torch.matmul(rows.float(), ones).view(batch, height // scale, 2, width // scale)
+    return sums.sum(dim=2)[:, None] * (1 / (6 * scale))

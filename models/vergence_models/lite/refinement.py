@@ -21,13 +21,18 @@ from vergence_models.layers import (
 )
 from vergence_models.lite.coarse import MIN_PX, beyond
 from vergence_models.lite.hypotheses import Hypotheses
-from vergence_models.lite.volume import Volume, lookup, lookup_row
+from vergence_models.lite.volume import Near, Volume, lookup, lookup_row
 from vergence_models.warp import cell_centres
 
 SURFACES = 3  # hypotheses of a cell
 FINE_PX = 2  # spacing of the fine descriptors along the right row, and so of the disparities
 REACH = 2  # entries looked up on either side of the current disparity
 TAPS = 2 * REACH + 1
+
+
+def near_columns(max_disparity_px: int) -> Near:
+    """The columns of the right image that the fine search meets."""
+    return Near(ratio=4 // FINE_PX, reach=max_disparity_px // FINE_PX, margin=REACH + 2)
 
 
 def rims(d: Tensor) -> Tensor:
@@ -41,7 +46,6 @@ class Refined(NamedTuple):
     disparity: Tensor  # [B, 1, H/4, W/4] px
     doubt: Tensor  # likewise: a logarithm of sigma, up to scale and bounds
     features: Tensor  # [B, C, H/4, W/4]
-    hypotheses: Hypotheses
 
 
 class Refinement(nn.Module):
@@ -51,7 +55,7 @@ class Refinement(nn.Module):
         super().__init__()
         width = config.fine_channels
         self.hidden = conv(config.hidden, 16, kernel=1)
-        self.first = conv(config.context_quarter + 16 + 4 * SURFACES + 1, width, kernel=1)
+        self.first = conv(config.context_quarter + 16 + 4 * SURFACES, width, kernel=1)
         self.down = conv(width, config.fine_low, stride=2)
         self.low = conv(config.fine_low, config.fine_low)
         self.lower = conv(config.fine_low, config.fine_low)
@@ -70,10 +74,10 @@ class Refinement(nn.Module):
         hidden: Tensor,
         prior: Tensor,
         context: Tensor,
-    ) -> Refined:
+    ) -> tuple[Refined, Hypotheses]:
         """Choose and fit. Hypotheses are the surface of 1/8 and its rims.
 
-        Volume of :func:`near_pairs` at 1/4; px at 1/8 and, 0 where unknown, at 1/4; hidden state at
+        Volume at 1/4; px at 1/8 and, 0 where unknown, at 1/4; hidden state at
         1/8, context at 1/4.
         """
         u, _ = cell_centres(prior.shape[2], prior.shape[3], 4, prior)
@@ -88,10 +92,9 @@ class Refinement(nn.Module):
         surfaces = torch.cat((plain, enlarge(rims(d_eighth))), dim=1)
         cost = lookup(pairs, position(surfaces))
         wide = box3(cost)
-        apart = squash(surfaces[:, 1:] - plain, 2.0)
-        moved = squash(carried - plain, 2.0)
+        apart = squash(torch.cat((surfaces[:, 1:], carried), dim=1) - plain, 2.0)
         up = enlarge(self.hidden(hidden))
-        told = torch.cat((cost, wide, apart, moved, hole, beyond(surfaces, scale=4)), dim=1)
+        told = torch.cat((cost, wide, apart, beyond(surfaces, scale=4)), dim=1)
         x = F.relu(joint(self.first, context, up, told))
         # Where an object ends shows in a wider view than 3x3 cells.
         low = F.relu6(self.lower(F.relu6(self.low(F.relu6(self.down(x))))))
@@ -111,13 +114,14 @@ class Refinement(nn.Module):
         step = carried - d
         # Interpolated entries flatten a peak between two of them: tell where between them it lies.
         phase = (looked_at - torch.floor(looked_at)).detach()
-        fitted = (taps, smooth, squash(step, 0.5), squash(offset, 0.5), apart, phase, hole)
+        steps = squash(torch.cat((step, offset), dim=1), 0.5)
+        fitted = (taps, smooth, steps, apart[:, :2], phase, hole)
         x = F.relu(joint(self.second, x, torch.cat(fitted, dim=1)))
         out = self.out(x)
         # The previous frame's surface is evidence too, while it agrees: half of a small step.
         keep = torch.sigmoid(4 * out[:, 1:2]) * torch.exp(-step.abs()) * (1 - hole)
         d = (d + keep * step + 2 * out[:, :1]).clamp(min=MIN_PX)
-        return Refined(d, out[:, 2:], x, hypotheses)
+        return Refined(d, out[:, 2:], x), hypotheses
 
     def enlarged(self, found: Refined) -> tuple[Tensor, Tensor]:
         """Full-size disparity and sigma, px [B, H, W]."""

@@ -16,41 +16,74 @@ BLOCKS = 8  # of columns: images are as wide as multiples of 32, so cells of 1/4
 
 
 class Volume(NamedTuple):
-    """For each cell the scores of a window of its row: entries ``first`` to ``first + N - 1``."""
+    """For each cell the scores of a window of its row: entries ``first`` to ``first + window - 1``.
 
-    scores: Tensor  # [B, H, W, N]
+    In a row of the image, entry e of the cell x stands at ``begin[x] + stride * (e - first[x])``.
+    """
+
+    scores: Tensor  # [B, H, ...]
+    begin: Tensor  # [W], float
     first: Tensor  # [W], float
+    stride: int
+    window: int
     last: int  # the row's last entry; outside of 0 .. last every score is 0
 
 
 def whole_rows(scores: Tensor) -> Volume:
     """A volume whose windows are all of the row, ``scores`` [B, H, W, N]."""
-    first = torch.zeros(scores.shape[2], dtype=scores.dtype, device=scores.device)
-    return Volume(scores, first, scores.shape[3] - 1)
+    width, count = scores.shape[2:]
+    begin = torch.arange(width, device=scores.device).to(scores.dtype) * count
+    return Volume(scores, begin, torch.zeros_like(begin), 1, count, count - 1)
 
 
-def near_pairs(left: Tensor, right: Tensor, *, reach: int, margin: int) -> Volume:
-    """Mean products of descriptors [B, C, H, W] and [B, C, H, r W] that are near in their row.
+class Near(NamedTuple):
+    """Which right entries a left cell meets: those up to ``reach`` to the left of its own.
 
-    The left cell x meets the right entries from r x - reach - margin to r x + margin, some more at
-    either end: a block of columns shares its window. What lies outside of the row is not masked.
+    And ``margin`` on either side of these, and some more: a block of columns shares its window.
     """
-    batch, channels, height, width = left.shape
-    ratio = right.shape[3] // width
-    block = width // BLOCKS
-    # In cells, as wide as left ones, whose entries are copied at once with all their channels.
-    before, after = -(-(reach + margin) // ratio), -(-margin // ratio)
-    start = torch.arange(BLOCKS, device=left.device) * block - before
-    cells = torch.arange(before + block + after, device=left.device) + start[:, None]
-    left_rows = left.permute(0, 2, 3, 1).reshape(batch, height, BLOCKS, block, channels)
-    right_rows = right.permute(0, 2, 3, 1).reshape(batch, height, width, ratio * channels)
-    right_rows = right_rows.index_select(2, cells.clamp(0, width - 1).flatten())
-    window = ratio * (before + block + after)
-    right_rows = right_rows.view(batch, height, BLOCKS, window, channels)
-    # Of a product, onnxruntime does the division on the way.
-    scores = torch.matmul(left_rows, right_rows.transpose(3, 4)) * (1 / channels)
-    first = (ratio * start)[:, None].expand(-1, block).reshape(width).to(left.dtype)
-    return Volume(scores.view(batch, height, width, window), first, ratio * width - 1)
+
+    ratio: int  # right entries per left cell
+    reach: int
+    margin: int
+
+    @property
+    def before(self) -> int:
+        """In cells, as wide as left ones, whose entries are copied at once with all channels."""
+        return -(-(self.reach + self.margin) // self.ratio)
+
+    @property
+    def after(self) -> int:
+        return -(-self.margin // self.ratio)
+
+    def pairs(self, left: Tensor, right: Tensor) -> Tensor:
+        """Mean products of descriptors [B, C, H, W] and [B, C, H, ratio W].
+
+        Of each block of columns its window of entries and its cells, [B, H, BLOCKS, N, W / BLOCKS].
+        What lies outside of the row is not masked.
+        """
+        batch, channels, height, width = left.shape
+        ratio, block = self.ratio, width // BLOCKS
+        start = torch.arange(BLOCKS, device=left.device) * block - self.before
+        cells = torch.arange(self.before + block + self.after, device=left.device)
+        cells = (cells + start[:, None]).clamp(0, width - 1)
+        # Of the mean the division first: what follows then only copies, which bytes can be.
+        left_rows = (left * (1 / channels)).permute(0, 2, 1, 3)
+        left_rows = left_rows.reshape(batch, height, channels, BLOCKS, block).transpose(2, 3)
+        right_rows = right.permute(0, 2, 3, 1).reshape(batch, height, width, ratio * channels)
+        right_rows = right_rows.index_select(2, cells.flatten())
+        window = ratio * (self.before + block + self.after)
+        right_rows = right_rows.view(batch, height, BLOCKS, window, channels)
+        return torch.matmul(right_rows, left_rows)
+
+    def volume(self, pairs: Tensor) -> Volume:
+        """Of what :meth:`pairs` gave."""
+        count, block = pairs.shape[3:]
+        blocks = torch.arange(BLOCKS, device=pairs.device)[:, None]
+        within = torch.arange(block, device=pairs.device)
+        begin = (blocks * (count * block) + within).flatten().to(pairs.dtype)
+        first = (self.ratio * (blocks * block - self.before)).expand(-1, block).flatten()
+        last = self.ratio * BLOCKS * block - 1
+        return Volume(pairs, begin, first.to(pairs.dtype), block, count, last)
 
 
 def lookup(volume: Volume, position: Tensor) -> Tensor:
@@ -83,11 +116,11 @@ def lookup_row(volume: Volume, position: Tensor, reach: int) -> Tensor:
 
 def gathered(volume: Volume, entry: Tensor) -> Tensor:
     """The scores at whole entries [B, K, H, W], float; the nearest in the window if it has none."""
-    batch, height, width, window = volume.scores.shape
-    begin = torch.arange(width, device=entry.device).to(entry.dtype) * window
+    batch, height = volume.scores.shape[:2]
     # Row by row, so that a row is still in the cache when its next entry is read.
-    by_row = (entry.transpose(1, 2) - volume.first).clamp(0, window - 1) + begin
+    by_row = (entry.transpose(1, 2) - volume.first).clamp(0, volume.window - 1)
+    by_row = by_row * volume.stride + volume.begin
     # Of single entries onnxruntime's gather of elements is four times as quick as that of slices.
-    rows = volume.scores.reshape(batch * height, width * window)
+    rows = volume.scores.reshape(batch * height, -1)
     found = rows.gather(1, by_row.long().reshape(batch * height, -1))
     return found.view(by_row.shape).transpose(1, 2)

@@ -17,7 +17,7 @@ from vergence_models.graphs import (
 )
 from vergence_models.raft.network import RaftGiven, RaftNetwork, RaftState
 from vergence_models.raft.update import CELL_PX, pyramid
-from vergence_models.stitch import Parts
+from vergence_models.stitch import TAKES_PLACE, Parts
 
 
 class Begin(nn.Module):
@@ -55,7 +55,7 @@ class End(nn.Module):
 def parts_of(network: RaftNetwork) -> Parts[Part]:
     """What comes before the iterations, one of them, and what comes after."""
     given, moving = RaftGiven._fields, tuple(f"at_{name}" for name in RaftState._fields)
-    moved = tuple(f"to_{name}" for name in RaftState._fields)
+    moved = tuple(TAKES_PLACE + name for name in moving)
     stride, cell = network.config.stride, network.config.stride // CELL_PX
     pairs: Sizes = {0: BATCH, 1: cell * ROWS, 2: cell * COLUMNS, 3: cell * COLUMNS}
     eighth, sixteenth = cells(stride, CELL_PX), cells(stride, 2 * CELL_PX)
@@ -64,7 +64,7 @@ def parts_of(network: RaftNetwork) -> Parts[Part]:
     begin = Begin(network)
     between = tuple(tensor.detach() for tensor in begin(*inputs))
     return Parts(
-        Part(begin, inputs, sizes, step_input_names(network), given + moving),
+        (Part(begin, inputs, sizes, step_input_names(network), given + moving),),
         Part(Iterate(network), between, given_sizes + moving_sizes, given + moving, moved),
         Part(End(network), between[3:], moving_sizes, moving, step_output_names(network)),
     )

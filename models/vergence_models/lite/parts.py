@@ -1,0 +1,119 @@
+"""The step of `lite` in the parts that its graphs are stitched from."""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+
+from vergence_models.graphs import (
+    BATCH,
+    COLUMNS,
+    ROWS,
+    Part,
+    Sizes,
+    cells,
+    step_input_names,
+    step_inputs,
+    step_output_names,
+)
+from vergence_models.lite.coarse import Clues
+from vergence_models.lite.network import Evidence, LiteNetwork, LiteState
+from vergence_models.lite.refinement import Refined
+from vergence_models.stitch import TAKES_PLACE, Parts
+from vergence_proto.model_io import LEFT, RIGHT
+
+NARROW = ("pairs", "context4", "context8", "context16")
+GIVEN = (*Clues._fields, *NARROW)
+
+
+class Wide(nn.Module):
+    """The wide search, and the state moved to the new view."""
+
+    def __init__(self, network: LiteNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        left, right, matrix, *state = inputs
+        moved = self.network.moved(LiteState(*state), matrix)
+        return *self.network.search_wide(left, right), *moved
+
+
+class Narrow(nn.Module):
+    """The narrow search's volume, and the context. It takes about as long as the other."""
+
+    def __init__(self, network: LiteNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, *images: Tensor) -> tuple[Tensor, ...]:
+        left, right = images
+        return self.network.search_narrow(left, right)
+
+
+class Iterate(nn.Module):
+    def __init__(self, network: LiteNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        fixed, features, *narrow = inputs[: len(GIVEN)]
+        evidence = Evidence(Clues(fixed, features), *narrow)
+        found = self.network.iterate(evidence, LiteState(*inputs[len(GIVEN) :]))
+        disparity, doubt, features = found.answer
+        return disparity, found.hidden, doubt, features
+
+
+class End(nn.Module):
+    def __init__(self, network: LiteNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        disparity, hidden, doubt, features = inputs
+        refined = Refined(disparity, doubt, features)
+        return *self.network.refinement.enlarged(refined), disparity, hidden
+
+
+def parts_of(network: LiteNetwork) -> Parts[Part]:
+    """Both searches, one iteration, and the way to full size."""
+    stride = network.config.stride
+    inputs, sizes = step_inputs(network)
+    columns = network.near
+    window = columns.ratio * COLUMNS + columns.ratio * (columns.before + columns.after)
+    moving = tuple(f"at_{name}" for name in LiteState._fields)  # outputs have the plain names
+    sizes_of: dict[str, Sizes] = {
+        "fixed": cells(stride, 8),
+        "features": {0: BATCH, 3: stride // 16 * ROWS, 4: stride // 16 * COLUMNS},
+        "pairs": {0: BATCH, 1: stride // 4 * ROWS, 3: window, 4: stride // 32 * COLUMNS},
+        "context4": cells(stride, 4),
+        "context8": cells(stride, 8),
+        "context16": cells(stride, 16),
+        "at_disparity": cells(stride, 4),
+        "at_hidden": cells(stride, 8),
+    }
+    wide, narrow = Wide(network), Narrow(network)
+    clues = tuple(tensor.detach() for tensor in wide(*inputs))
+    found = tuple(tensor.detach() for tensor in narrow(*inputs[:2]))
+    between = (*clues[:2], *found, *clues[2:])
+    iterate = Iterate(network)
+    answer = tuple(tensor.detach() for tensor in iterate(*between))
+    return Parts(
+        begin=(
+            Part(wide, inputs, sizes, step_input_names(network), (*Clues._fields, *moving)),
+            Part(narrow, inputs[:2], sizes[:2], (LEFT, RIGHT), NARROW),
+        ),
+        iterate=Part(
+            iterate,
+            between,
+            tuple(sizes_of[name] for name in (*GIVEN, *moving)),
+            (*GIVEN, *moving),
+            tuple(TAKES_PLACE + name for name in (*moving, "doubt", "features4")),
+        ),
+        end=Part(
+            End(network),
+            answer,
+            tuple(cells(stride, scale) for scale in (4, 8, 4, 4)),
+            (*moving, "doubt", "features4"),
+            step_output_names(network),
+        ),
+    )

@@ -1,0 +1,108 @@
+"""Laws of stages: cut apart, a step is what it was whole."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import onnxruntime
+import pytest
+from numpy.typing import NDArray
+from onnx import ModelProto, NodeProto, TensorProto, helper, numpy_helper
+
+from vergence_models.stages import StageError, handed_on, in_stages
+from vergence_models.stitch import Parts, stitched
+
+Array = NDArray[Any]
+COUNTS = (1, 3)
+
+
+def part(
+    nodes: list[NodeProto], inputs: list[str], outputs: list[str], weight: float
+) -> ModelProto:
+    def described(names: list[str]) -> list[Any]:
+        return [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N"]) for name in names]
+
+    constants = [numpy_helper.from_array(np.array([weight], np.float32), "weight")]
+    graph = helper.make_graph(nodes, "part", described(inputs), described(outputs), constants)
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+
+
+def node(op: str, inputs: str, output: str) -> NodeProto:
+    return helper.make_node(op, inputs.split(), [output], name=output)
+
+
+def parts() -> Parts[ModelProto]:
+    """state = state * 0.5 + left * 3 + right / 7, over and over; then twice that."""
+    return Parts(
+        begin=(
+            part(
+                [node("Mul", "left weight", "near"), node("Neg", "state", "at_state")],
+                ["left", "right", "state"],
+                ["near", "at_state"],
+                3.0,
+            ),
+            part([node("Div", "right weight", "far")], ["right"], ["far"], 7.0),
+        ),
+        iterate=part(
+            [
+                node("Mul", "at_state weight", "half"),
+                node("Add", "half near", "more"),
+                node("Add", "more far", "to_at_state"),
+            ],
+            ["near", "far", "at_state"],
+            ["to_at_state"],
+            0.5,
+        ),
+        end=part([node("Mul", "at_state weight", "answer")], ["at_state"], ["answer"], 2.0),
+    )
+
+
+def run(model: ModelProto, tensors: dict[str, Array]) -> dict[str, Array]:
+    session = onnxruntime.InferenceSession(
+        model.SerializeToString(), providers=["CPUExecutionProvider"]
+    )
+    feeds = {entry.name: tensors[entry.name] for entry in session.get_inputs()}
+    names = [entry.name for entry in session.get_outputs()]
+    return dict(zip(names, session.run(names, feeds), strict=True))
+
+
+def test_stages_one_after_another_are_the_whole_step() -> None:
+    models = {count: stitched(parts(), count) for count in COUNTS}
+    stages, files = in_stages("tiny", models, handed_on(parts()))
+    assert stages == {
+        count: [["tiny_begin_0.onnx", "tiny_begin_1.onnx"], [f"tiny_{count}.onnx"]]
+        for count in COUNTS
+    }
+    random = np.random.default_rng(0)
+    given = {name: random.normal(size=4).astype(np.float32) for name in ("left", "right", "state")}
+    answers = []
+    for count in COUNTS:
+        known = dict(given)
+        for stage in stages[count]:
+            known |= {
+                name: value for file in stage for name, value in run(files[file], known).items()
+            }
+        np.testing.assert_array_equal(known["answer"], run(models[count], given)["answer"])
+        answers.append(known["answer"])
+    assert not np.array_equal(answers[0], answers[1])
+
+
+def test_a_graph_holds_only_its_own() -> None:
+    models = {count: stitched(parts(), count) for count in COUNTS}
+    _, files = in_stages("tiny", models, handed_on(parts()))
+    kept = {
+        name: {tensor.name for tensor in model.graph.initializer} for name, model in files.items()
+    }
+    assert kept["tiny_begin_0.onnx"] == {"begin_0.weight"}
+    assert kept["tiny_begin_1.onnx"] == {"begin_1.weight"}
+    assert kept["tiny_3.onnx"] == {"iterate.weight", "end.weight"}
+    assert [entry.name for entry in files["tiny_begin_1.onnx"].graph.input] == ["right"]
+
+
+def test_a_beginning_that_depends_on_the_count_is_refused() -> None:
+    models = {count: stitched(parts(), count) for count in COUNTS}
+    (weight,) = (each for each in models[3].graph.initializer if each.name == "begin_1.weight")
+    weight.CopyFrom(numpy_helper.from_array(np.array([8.0], np.float32), "begin_1.weight"))
+    with pytest.raises(StageError, match=r"tiny_begin_1\.onnx: is another with 3 iterations"):
+        in_stages("tiny", models, handed_on(parts()))
