@@ -1,4 +1,9 @@
-"""The steps that wait for the model, taken together across streams in one dedicated thread."""
+"""The steps that wait for the model, taken across streams: together, or each in a lane of its own.
+
+A model on a GPU takes batches. One on a CPU may have lanes instead: threads that step it one frame
+each, whenever one of them is free. In a batch two busy streams would hardly ever meet, as each
+frame arrives while the other stream's is in the model.
+"""
 
 import asyncio
 import logging
@@ -46,10 +51,11 @@ class _Waiting:
 
 
 class StepBatcher:
-    """Gathers the steps that wait for the model and runs them together, oldest first.
+    """Gathers the steps that wait for the model and runs them as it takes them, oldest first.
 
     Live steps come before all others, which fill the gaps that they leave, in batches of their
-    own: one that would be in the way of the next live frame is held back, but not for ever.
+    own: one that would be in the way of a live frame, in the model or expected, is held back, but
+    not for ever.
     Every waiter gets a result or an exception: ModelFailed, NonFinite, FrameStale, or Draining
     when the batcher ends first. A caller never has two steps of one stream waiting.
     """
@@ -63,30 +69,33 @@ class StepBatcher:
         metrics: Metrics,
     ) -> None:
         self._model = model
-        self._max_batch = max_batch
+        # The first row of a batch would wait for the last while another lane stands empty.
+        self._max_batch = max_batch if model.lanes == 1 else 1
         self._clock = clock
         self._metrics = metrics
         self._waiting: list[_Waiting] = []
-        self._arrived = asyncio.Event()
+        self._in_model: list[_Waiting] = []
+        self._free_lanes = asyncio.Semaphore(model.lanes)
+        self._changed = asyncio.Event()  # a step arrived, or left the model
         self._rhythm = LiveRhythm()
         self._work_s: dict[tuple[object, ...], float] = {}  # how long each shape of work took
 
     async def __aenter__(self) -> Self:
-        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="model")
+        self._threads = ThreadPoolExecutor(self._model.lanes, thread_name_prefix="model")
         self._worker = asyncio.create_task(self._run(), name="step-batcher")
         return self
 
     async def __aexit__(self, *exc_info: object) -> None:
         self._worker.cancel()
         await asyncio.gather(self._worker, return_exceptions=True)
-        await asyncio.to_thread(self._thread.shutdown)
-        for item in _wanted(self._waiting):
+        await asyncio.to_thread(self._threads.shutdown)
+        for item in _wanted([*self._in_model, *self._waiting]):
             item.answer.set_exception(Draining("the server stopped before it took the frame"))
 
     async def warm_up(self, iterations: Sequence[int]) -> None:
-        """Load the model, in the thread that will run it."""
+        """Load the model, in a thread that will run it."""
         loop = asyncio.get_running_loop()
-        await loop.run_in_executor(self._thread, self._model.warm_up, iterations)
+        await loop.run_in_executor(self._threads, self._model.warm_up, iterations)
 
     async def step(
         self, step: Step, *, deadline_s: float | None = None, live_stream: str | None = None
@@ -100,42 +109,53 @@ class StepBatcher:
         self._waiting.append(_Waiting(step, now_s, deadline_s, live_stream, answer))
         if live_stream is not None:
             self._rhythm.arrived(live_stream, now_s)
-        self._arrived.set()
+        self._changed.set()
         return await answer
 
     async def _run(self) -> None:
-        batch: list[_Waiting] = []
-        try:
+        async with asyncio.TaskGroup() as lanes:
             while True:
-                await self._arrived.wait()
-                batch = self._next_batch()
-                if batch and (hold_s := self._hold_s(batch[0])) > 0:
-                    self._waiting = batch + self._waiting
-                    batch = []
-                    await self._next_arrival(within_s=hold_s)
-                elif batch:
-                    await self._step_together(batch)
-        finally:
-            self._waiting += batch  # those without an answer get one from __aexit__
+                await self._free_lanes.acquire()
+                batch = await self._next_batch()
+                self._in_model += batch
+                lanes.create_task(self._in_lane(batch))
+
+    async def _in_lane(self, batch: list[_Waiting]) -> None:
+        await self._step_together(batch)
+        # Not where it is cancelled: those without an answer get one from __aexit__.
+        self._in_model = [item for item in self._in_model if item not in batch]
+        self._free_lanes.release()
+        self._changed.set()
+
+    async def _next_batch(self) -> list[_Waiting]:
+        """What the model is to do next, as soon as it is time for it."""
+        while True:
+            batch = self._oldest()
+            hold_s = self._hold_s(batch[0]) if batch else None
+            if hold_s == 0:
+                self._waiting = [item for item in self._waiting if item not in batch]
+                return batch
+            self._changed.clear()
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self._changed.wait(), hold_s)
 
     def _hold_s(self, first: _Waiting) -> float:
         """How long the work of ``first`` is to stay out of the way of a live frame."""
         now_s = self._clock()
-        due = None if first.live else self._rhythm.next_due(now_s)
-        if due is None or now_s - first.since_s > _PATIENCE_S:
+        patience_s = _PATIENCE_S - (now_s - first.since_s)
+        if first.live or patience_s <= 0:
+            return 0.0
+        if any(item.live for item in self._in_model):
+            return patience_s
+        if (due := self._rhythm.next_due(now_s)) is None:
             return 0.0
         # What was never seen is taken to be as long as the longest that was.
         longest_s = max(self._work_s.values(), default=0.0)
         ends_s = now_s + self._work_s.get(first.shape_of_work, longest_s)
         return due.until_s - now_s if ends_s > due.at_s else 0.0
 
-    async def _next_arrival(self, *, within_s: float) -> None:
-        self._arrived.clear()
-        with suppress(TimeoutError):
-            await asyncio.wait_for(self._arrived.wait(), within_s)
-        self._arrived.set()
-
-    def _next_batch(self) -> list[_Waiting]:
+    def _oldest(self) -> list[_Waiting]:
+        """Of what waits: live or not, then oldest first, as much as the model takes together."""
         now_s = self._clock()
         wanted = _wanted(self._waiting)
         for item in wanted:
@@ -146,20 +166,17 @@ class StepBatcher:
                         "maximum age; the stream is as it was"
                     )
                 )
-        wanted = sorted(_wanted(wanted), key=lambda item: not item.live)  # stable: oldest first
-        work = wanted[0].shape_of_work if wanted else None
-        batch = [item for item in wanted if item.shape_of_work == work][: self._max_batch]
-        self._waiting = [item for item in wanted if item not in batch]
-        if not self._waiting:
-            self._arrived.clear()
-        return batch
+        # The sort is stable: oldest first.
+        self._waiting = sorted(_wanted(wanted), key=lambda item: not item.live)
+        work = self._waiting[0].shape_of_work if self._waiting else None
+        return [item for item in self._waiting if item.shape_of_work == work][: self._max_batch]
 
     async def _step_together(self, batch: list[_Waiting]) -> None:
         started_s = self._clock()
         steps = [item.step for item in batch]
         loop = asyncio.get_running_loop()
         try:
-            results = await loop.run_in_executor(self._thread, self._model.step, steps)
+            results = await loop.run_in_executor(self._threads, self._model.step, steps)
         except Exception as error:
             if len(batch) == 1:
                 _fail(batch[0], error)

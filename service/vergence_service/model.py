@@ -107,7 +107,7 @@ class StepResult:
 
 
 class StereoModel(Protocol):
-    """A network that takes steps. Called from one thread at a time."""
+    """A network that takes steps."""
 
     @property
     def card(self) -> ModelCard: ...
@@ -115,6 +115,11 @@ class StereoModel(Protocol):
     @property
     def provider(self) -> str:
         """What it runs on, as told to clients."""
+        ...
+
+    @property
+    def lanes(self) -> int:
+        """How many threads may call ``step`` at once; above 1, a batch of several gains nothing."""
         ...
 
     def warm_up(self, iterations: Sequence[int]) -> None:
@@ -133,7 +138,7 @@ class OnnxStereoModel:
     """A model of the manifest under onnxruntime.
 
     States stay where the first provider computes them; ``states_on`` names another device.
-    ``threads`` are those of one step, 0 for one a core. Raises ManifestError (see
+    ``threads`` are those of its steps together, 0 for one a core. Raises ManifestError (see
     :func:`vergence_proto.model_io.load_model_card`) and ProviderUnavailable.
     """
 
@@ -165,6 +170,10 @@ class OnnxStereoModel:
     @property
     def provider(self) -> str:
         return self._provider
+
+    @property
+    def lanes(self) -> int:
+        return self._graphs.lanes if self._device is None else 1
 
     def warm_up(self, iterations: Sequence[int]) -> None:
         for count in iterations:

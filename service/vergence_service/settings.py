@@ -86,7 +86,7 @@ class ModelSettings(_Section):
     providers: tuple[Literal["cpu", "cuda", "tensorrt", "openvino"], ...] = Field(
         default=("cpu",), min_length=1, description="in order of preference"
     )
-    threads: int = Field(default=0, ge=0, description="of one step; 0: one a core")
+    threads: int = Field(default=0, ge=0, description="of all steps; 0: one a core")
     allow_spinning: bool = Field(default=False, description="quicker steps, for all of a core")
     iterations: PositiveInt = Field(default=1, description="of a warm step")
     cold_iterations: PositiveInt = Field(default=5, description="of a cold start, at most")

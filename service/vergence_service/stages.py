@@ -2,13 +2,16 @@
 
 The graphs of a stage run side by side, on threads of their own. Where a network has large parts
 that do not need each other, that is as quick as to divide every operator between the same threads,
-for less work: the threads meet once a stage and each keeps to its own cache.
+for less work: the threads meet once a stage and each keeps to its own cache. While several steps
+are taken at once it is they that run side by side, each graph after graph.
 """
 
 import logging
 import os
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from onnxruntime import InferenceSession, SessionOptions
 
-from vergence_proto.model_io import DISPARITY, SIGMA, ManifestError, ModelCard, Stage
+from vergence_proto.model_io import DISPARITY, SIGMA, ManifestError, ModelCard
 from vergence_service.providers import Resident, Tensor, run_on_device, start_session
 
 log = logging.getLogger(__name__)
@@ -53,11 +56,12 @@ class _Part:
 
 
 class StagedGraphs:
-    """The graphs of a model, each loaded once. Called from one thread at a time.
+    """The graphs of a model, each loaded once.
 
-    ``providers`` are onnxruntime's names. A step uses ``threads`` threads, 0 for one a core; with
-    one, the graphs of a stage run one after the other. With a ``device`` all but the maps stays
-    there, from stage to stage and in what a step returns.
+    ``providers`` are onnxruntime's names. Steps use ``threads`` threads, 0 for one a core. As many
+    of them as ``lanes`` may run at once: one that is alone runs the graphs of a stage side by side,
+    one that is not runs them one after the other, to the same result. With a ``device`` all but the
+    maps stays there, from stage to stage and in what a step returns.
     """
 
     def __init__(
@@ -71,47 +75,67 @@ class StagedGraphs:
     ) -> None:
         self._card = card
         self._providers = providers
-        self._threads = threads
         self._allow_spinning = allow_spinning
         self._device = device
-        self._sessions: dict[tuple[Path, int], InferenceSession] = {}
+        self._sessions: dict[Path, InferenceSession] = {}
         self._steps: dict[int, list[list[_Part]]] = {}
-        widest = max(len(stage) for stages in card.graphs.values() for stage in stages)
-        beside = min(threads or _cores(), widest) - 1  # the caller's thread takes a graph as well
-        self._beside = ThreadPoolExecutor(beside, thread_name_prefix="graph") if beside else None
+        width = max(len(stage) for stages in card.graphs.values() for stage in stages)
+        self.lanes = min(threads or _cores(), width)
+        # A model that is cut for several threads leaves each of them its own graph, also in stages
+        # of one: two threads that shared the last graph of `lite`, operator by operator, took 15 %
+        # less time but a fifth more work, while another stream's step can use the second thread
+        # whole. Alone: onnxruntime knows best what "one a core" is.
+        self._operator_threads = max(1, (threads or _cores()) // width) if width > 1 else threads
+        self._beside = ThreadPoolExecutor(self.lanes, thread_name_prefix="graph")
+        self._running = 0
+        self._counting = threading.Lock()
+        self._loading = threading.Lock()
 
     def close(self) -> None:
         """End the threads; no step may follow."""
-        if self._beside is not None:
-            self._beside.shutdown()
+        self._beside.shutdown()
 
     def load(self, iterations: int) -> None:
         """Raises ManifestError, the graphs do not fit together, and ProviderUnavailable."""
-        if iterations in self._steps:
-            return
-        stages = [self._loaded(stage) for stage in self._card.graphs[iterations]]
+        with self._loading:
+            if iterations not in self._steps:
+                self._steps[iterations] = self._loaded(iterations)
+                log.info("loaded %s, %d iterations", self._card.name, iterations)
+
+    def _loaded(self, iterations: int) -> list[list[_Part]]:
+        stages = [[*map(self._session, stage)] for stage in self._card.graphs[iterations]]
         _require_fit(self._card, iterations, stages)
         needed = set(self._card.output_names)
         parts: list[list[_Part]] = []
         for stage in reversed(stages):
             parts.insert(0, [_Part.of(session, needed) for session in stage])
             needed.update(name for part in parts[0] for name in part.inputs)
-        self._steps[iterations] = parts
-        log.info("loaded %s, %d iterations", self._card.name, iterations)
+        return parts
 
     def run(self, iterations: int, given: Tensors) -> dict[str, Tensor]:
         """One step of a batch: the card's inputs to the card's outputs, by name."""
         self.load(iterations)
         found: dict[str, Tensor] = {}
-        for parts in self._steps[iterations]:
-            for outputs in self._side_by_side(parts, {**given, **found}):
-                found |= outputs
+        with self._counted():
+            for parts in self._steps[iterations]:
+                for outputs in self._run_stage(parts, {**given, **found}):
+                    found |= outputs
         return {name: found[name] for name in self._card.output_names}
 
-    def _side_by_side(self, parts: Sequence[_Part], tensors: Tensors) -> list[dict[str, Tensor]]:
-        if self._beside is None:
+    @contextmanager
+    def _counted(self) -> Iterator[None]:
+        with self._counting:
+            self._running += 1
+        try:
+            yield
+        finally:
+            with self._counting:
+                self._running -= 1
+
+    def _run_stage(self, parts: Sequence[_Part], tensors: Tensors) -> list[dict[str, Tensor]]:
+        if self.lanes == 1 or self._running > 1:
             return [part.run(tensors, self._device) for part in parts]
-        first, *others = parts
+        first, *others = parts  # the caller's thread takes a graph as well
         futures: list[Future[dict[str, Tensor]]] = []
         try:
             futures += (self._beside.submit(part.run, tensors, self._device) for part in others)
@@ -120,16 +144,10 @@ class StagedGraphs:
             wait(futures)  # also where one fails: no graph runs on into the next step
         return [outputs, *(future.result() for future in futures)]
 
-    def _loaded(self, stage: Stage) -> list[InferenceSession]:
-        threads = self._threads  # alone: onnxruntime knows best what "one a core" is
-        if len(stage) > 1:
-            threads = max(1, (threads or _cores()) // len(stage))
-        return [self._session(path, threads) for path in stage]
-
-    def _session(self, graph: Path, threads: int) -> InferenceSession:
-        if (graph, threads) not in self._sessions:
+    def _session(self, graph: Path) -> InferenceSession:
+        if graph not in self._sessions:
             options = SessionOptions()
-            options.intra_op_num_threads = threads
+            options.intra_op_num_threads = self._operator_threads
             # Planning the reuse of buffers took a second of a long graph's start and saved no
             # memory: the arena gives freed buffers out again without a plan, and steps are as
             # quick.
@@ -137,8 +155,8 @@ class StagedGraphs:
             if not self._allow_spinning:
                 # As long as the next operator of a step may take to come, never between steps.
                 options.add_session_config_entry("session.intra_op.spin_duration_us", "20")
-            self._sessions[graph, threads] = start_session(graph, options, self._providers)
-        return self._sessions[graph, threads]
+            self._sessions[graph] = start_session(graph, options, self._providers)
+        return self._sessions[graph]
 
 
 def _require_fit(

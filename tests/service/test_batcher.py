@@ -1,15 +1,16 @@
 """Every waiter gets its own result or an exception, whatever else is in its batch."""
 
 import asyncio
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
 from prometheus_client import CollectorRegistry
 
 from tests.support.frames import RIG, make_frame
-from tests.support.models import RAISES, RecallModel
+from tests.support.models import NOT_FINITE, RAISES, RecallModel
 from tests.support.server import ManualClock
-from vergence_proto.errors import Draining, FrameStale, ModelFailed
+from vergence_proto.errors import Draining, FrameStale, ModelFailed, NonFinite
 from vergence_proto.geometry import RectifiedRig
 from vergence_service.batcher import StepBatcher, TimedResult
 from vergence_service.metrics import Metrics
@@ -30,6 +31,17 @@ def make_batcher(
 def make_step(brightness: int, *, rig: RectifiedRig = RIG, iterations: int = 1) -> Step:
     frame = make_frame(1, brightness=brightness, rig=rig)
     return Step(View(frame.left, frame.right, rig, frame.capture_ns), None, iterations)
+
+
+async def all_in_the_model(
+    batcher: StepBatcher, model: RecallModel, brightnesses: Sequence[int] = ()
+) -> list[asyncio.Task[TimedResult]]:
+    """As many steps as the model has lanes, all of them in it; it is busy."""
+    steps = []
+    for brightness in brightnesses or range(1, model.lanes + 1):
+        steps.append(asyncio.create_task(batcher.step(make_step(brightness))))
+        await asyncio.to_thread(model.wait_until_entered)
+    return steps
 
 
 async def gathered_behind_another(
@@ -126,14 +138,60 @@ async def test_a_caller_that_gives_up_does_not_stop_the_others() -> None:
     assert impatient.cancelled()
 
 
-async def test_waiters_are_told_when_the_batcher_ends() -> None:
-    model = RecallModel()
+@pytest.mark.parametrize("lanes", [1, 2])
+async def test_waiters_are_told_when_the_batcher_ends(lanes: int) -> None:
+    model = RecallModel(lanes=lanes)
     with model.busy():
         async with make_batcher(model) as batcher:
-            in_the_model = asyncio.create_task(batcher.step(make_step(1)))
-            await asyncio.to_thread(model.wait_until_entered)
-            waiting = asyncio.create_task(batcher.step(make_step(2)))
+            steps = [*await all_in_the_model(batcher, model)]
+            steps.append(asyncio.create_task(batcher.step(make_step(99))))
             await asyncio.sleep(0)
             asyncio.get_running_loop().call_later(0.02, model.let_go)
-    outcomes = await asyncio.gather(in_the_model, waiting, return_exceptions=True)
-    assert [type(outcome) for outcome in outcomes] == [Draining, Draining]
+    outcomes = await asyncio.gather(*steps, return_exceptions=True)
+    assert [type(outcome) for outcome in outcomes] == [Draining] * (lanes + 1)
+
+
+async def test_lanes_are_filled_as_steps_arrive_and_taken_by_one_step_each() -> None:
+    model = RecallModel(lanes=2)
+    async with make_batcher(model, max_batch=8) as batcher:
+        with model.busy():
+            steps = [*await all_in_the_model(batcher, model)]
+            steps += [asyncio.create_task(batcher.step(make_step(i))) for i in range(50, 55)]
+            await asyncio.sleep(0.02)
+            assert model.batches == [1, 1], "more steps were in the model than it has lanes"
+        for step, brightness in zip(steps, [1, 2, *range(50, 55)], strict=True):
+            expected = model.step([make_step(brightness)])[0].offset_px
+            np.testing.assert_array_equal((await step).result.offset_px, expected)
+    assert set(model.batches) == {1}
+
+
+async def test_no_stream_is_overtaken_in_lanes() -> None:
+    """A stream whose frame was taken goes to the end of the queue; others' frames come first."""
+    model, taken = RecallModel(lanes=2), list[int]()
+
+    async def keep_stepping(stream: int) -> None:
+        for _ in range(20):
+            await batcher.step(make_step(stream), live_stream=str(stream))
+            taken.append(stream)
+
+    async with make_batcher(model) as batcher:
+        await asyncio.gather(*map(keep_stepping, range(5)))
+    for turn in range(2, 19):  # two lanes may end in any order
+        counts = [taken[: 5 * turn].count(stream) for stream in range(5)]
+        assert max(counts) - min(counts) <= 2
+
+
+@pytest.mark.parametrize("bad", [RAISES, NOT_FINITE])
+async def test_a_failure_in_one_lane_does_not_reach_the_other(bad: int) -> None:
+    model = RecallModel(lanes=2)
+    async with make_batcher(model) as batcher:
+        with model.busy():
+            steps = await all_in_the_model(batcher, model, brightnesses=(bad, 70))
+        failed, fine = await asyncio.gather(*steps, return_exceptions=True)
+        assert isinstance(failed, ModelFailed if bad == RAISES else NonFinite)
+        assert isinstance(fine, TimedResult)
+        model.batches.clear()
+        with model.busy():  # both lanes are free again
+            again = await all_in_the_model(batcher, model)
+        await asyncio.gather(*again)
+    assert model.batches == [1, 1]

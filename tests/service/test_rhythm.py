@@ -64,6 +64,31 @@ async def test_a_step_that_would_be_in_the_way_of_a_live_frame_waits_for_it() ->
     assert model.stepped == [OTHER, LIVE, LIVE, LIVE, LIVE, OTHER + 1]
 
 
+async def test_a_free_lane_is_not_for_others_while_a_live_step_is_in_the_model() -> None:
+    model = RecallModel(lanes=2)
+    async with make_batcher(model) as batcher:
+        with model.busy():
+            urgent = asyncio.create_task(live(batcher))
+            await asyncio.to_thread(model.wait_until_entered)
+            other = asyncio.create_task(batcher.step(make_step(OTHER)))
+            await asyncio.sleep(0.02)
+            assert model.batches == [1]
+            model.batches.clear()
+        await asyncio.wait_for(asyncio.gather(urgent, other), 1.0)
+    assert model.batches == [1]
+
+
+async def test_a_live_step_takes_the_free_lane_beside_another() -> None:
+    model = RecallModel(lanes=2)
+    async with make_batcher(model) as batcher:
+        with model.busy():
+            other = asyncio.create_task(batcher.step(make_step(OTHER)))
+            await asyncio.to_thread(model.wait_until_entered)
+            urgent = asyncio.create_task(live(batcher))
+            await asyncio.to_thread(model.wait_until_entered)
+        await asyncio.gather(urgent, other)
+
+
 async def test_a_step_that_fits_into_the_gap_is_taken_at_once() -> None:
     clock = ManualClock()
     async with make_batcher(TimedModel(clock), clock=clock) as batcher:

@@ -2,12 +2,15 @@
 
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from onnxruntime.capi.onnxruntime_pybind11_state import InvalidArgument
 
 from tests.support.frames import make_frame
@@ -53,11 +56,11 @@ def make_view(frame_id: int) -> View:
     return View(left, right, RIG, frame.capture_ns, frame.pose.world_from_left)
 
 
-def walk(model: OnnxStereoModel, *, frames: int = 4) -> list[StepResult]:
+def walk(model: OnnxStereoModel, *, first: int = 1, frames: int = 4) -> list[StepResult]:
     """A sequence that starts with two iterations and goes on with one."""
     state: RecurrentState | None = None
     results = []
-    for i in range(1, frames + 1):
+    for i in range(first, first + frames):
         [result] = model.step([Step(make_view(i), state, 1 if state else 2)])
         results.append(result)
         state = result.state
@@ -85,6 +88,63 @@ def test_stages_answer_bit_for_bit_what_the_whole_graph_answers(
     for one, other in zip(expected, found, strict=True):
         assert_same(one, other)
         assert all(isinstance(each, Resident) == bool(states_on) for each in other.state.tensors)
+
+
+@pytest.fixture(scope="module", params=[2, 3, 4], ids="{} threads".format)
+def laned(request: pytest.FixtureRequest) -> Iterator[OnnxStereoModel]:
+    with opened("staged", threads=request.param) as model:
+        yield model
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    streams=st.lists(
+        st.tuples(st.integers(1, 1000), st.integers(1, 12)), min_size=2, max_size=5, unique=True
+    )
+)
+def test_streams_that_step_at_once_get_bit_for_bit_what_each_gets_alone(
+    laned: OnnxStereoModel, streams: list[tuple[int, int]]
+) -> None:
+    alone = [walk(laned, first=first, frames=frames) for first, frames in streams]
+    with ThreadPoolExecutor(laned.lanes) as threads:
+        walks = [
+            threads.submit(walk, laned, first=first, frames=frames) for first, frames in streams
+        ]
+    for expected, found in zip(alone, walks, strict=True):
+        for one, other in zip(expected, found.result(), strict=True):
+            assert_same(one, other)
+
+
+@pytest.mark.parametrize(
+    ("name", "threads", "states_on", "lanes"),
+    [
+        ("staged", 1, None, 1),
+        ("staged", 2, None, 2),
+        ("staged", 8, None, 2),
+        ("staged", 2, "cpu", 1),
+        ("whole", 2, None, 1),
+    ],
+    ids=["one thread", "two threads", "more threads than graphs", "a device", "no stages"],
+)
+def test_there_are_lanes_for_as_many_graphs_as_run_side_by_side(
+    name: str, threads: int, states_on: str | None, lanes: int
+) -> None:
+    with opened(name, threads=threads, states_on=states_on) as model:
+        assert model.lanes == lanes
+
+
+def test_a_stream_that_fails_does_not_disturb_the_one_beside_it() -> None:
+    bad = [Step(whiten(make_view(2), left=left, right=not left), None, 1) for left in (True, False)]
+    with opened("staged") as model, ThreadPoolExecutor(1) as beside:
+        expected = walk(model, frames=50)
+        found = beside.submit(walk, model, frames=50)
+        while not found.done():
+            for step in bad:
+                with pytest.raises(InvalidArgument, match="out of data bounds"):
+                    model.step([step])
+        for one, other in zip(expected, found.result(), strict=True):
+            assert_same(one, other)
+        assert_same(walk(model, frames=1)[0], expected[0])
 
 
 def test_a_batch_of_staged_steps_gives_each_stream_its_own() -> None:

@@ -1,6 +1,8 @@
 """The live call over a real gRPC server: answers, order, freshness, flow."""
 
 import asyncio
+from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 from tests.support.frames import RIG, frame_message, make_frame
 from tests.support.models import RecallModel
 from tests.support.server import RawCall, connected, raw_stream, running_server
+from tests.support.weights_copy import WEIGHTS
 from vergence_proto import codec
 from vergence_proto.geometry import RectifiedRig
 from vergence_proto.types import StereoRig
@@ -139,7 +142,14 @@ async def test_a_client_that_does_not_read_is_not_sent_what_is_old_by_then() -> 
     assert len(maps) < 10
 
 
-async def test_two_clients_at_once_get_what_each_gets_alone_from_the_weights_that_ship() -> None:
+@pytest.mark.parametrize(
+    ("weights", "name"),
+    [(packaged_weights_dir(), "lite"), (WEIGHTS, "staged")],
+    ids=["the weights that ship", "side by side"],
+)
+async def test_two_clients_at_once_get_what_each_gets_alone_from_real_graphs(
+    weights: Path, name: str
+) -> None:
     rig = RectifiedRig(256, 128, 200.0, 200.0, 127.5, 127.5, 63.5, 0.1)
     opening: dict[str, Any] = {"rig": StereoRig.from_rectified(rig)}
 
@@ -148,16 +158,15 @@ async def test_two_clients_at_once_get_what_each_gets_alone_from_the_weights_tha
         answers = [await call.ask(frame_message(frame)) for frame in frames]
         return [answer.disparity.disparity.data for answer in answers]
 
-    model = OnnxStereoModel(
-        packaged_weights_dir(), "lite", providers=["cpu"], threads=2, allow_spinning=False
-    )
-    async with running_server(model, model__max_batch=4) as server:
-        async with raw_stream(server, **opening) as one, raw_stream(server, **opening) as other:
-            together = await asyncio.gather(walk(one, 20), walk(other, 160))
-        alone = []
-        for brightness in (20, 160):
-            async with raw_stream(server, **opening) as call:
-                alone.append(await walk(call, brightness))
+    model = OnnxStereoModel(weights, name, providers=["cpu"], threads=2, allow_spinning=False)
+    with closing(model):
+        async with running_server(model, model__max_batch=4) as server:
+            async with raw_stream(server, **opening) as one, raw_stream(server, **opening) as other:
+                together = await asyncio.gather(walk(one, 20), walk(other, 160))
+            alone = []
+            for brightness in (20, 160):
+                async with raw_stream(server, **opening) as call:
+                    alone.append(await walk(call, brightness))
     assert alone == list(together)
     assert all(len(data) == 4 * rig.width * rig.height for walked in alone for data in walked)
 

@@ -30,7 +30,8 @@ class RecallModel:
         weights_sha256="0" * 64,
     )
 
-    def __init__(self) -> None:
+    def __init__(self, *, lanes: int = 1) -> None:
+        self.lanes = lanes
         self.batches: list[int] = []
         self._free = threading.Event()
         self._free.set()
