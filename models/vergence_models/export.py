@@ -11,6 +11,7 @@ import dataclasses
 import hashlib
 import json
 import logging
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -30,11 +31,11 @@ from vergence_models.lite.network import LiteNetwork
 from vergence_models.lite.parts import parts_of as lite_parts_of
 from vergence_models.raft.network import RaftNetwork
 from vergence_models.raft.parts import parts_of as raft_parts_of
-from vergence_models.runs import Run, read_run
+from vergence_models.runs import Run, RunError, read_run
 from vergence_models.stages import handed_on, in_stages
 from vergence_models.stepping import OnnxNetwork, SteppedNetwork
 from vergence_models.stitch import Parts, stitched, write_with_shared_weights
-from vergence_models.tiers import AnyNetwork, build_network
+from vergence_models.tiers import AnyNetwork, trained_network
 from vergence_proto.model_io import MANIFEST_FORMAT, MANIFEST_NAME
 
 log = logging.getLogger("vergence_models.export")
@@ -103,8 +104,7 @@ def export_run(run: Run, config: Config, out: Path, *, int8_clips: ClipPool | No
 
     With ``int8_clips`` the graphs are int8 ones, made of those that were checked.
     """
-    network = build_network(run.network).eval()
-    network.load_state_dict(run.weights)
+    network = trained_network(run)
     parts = exported_parts(network)
     models = {count: stitched(parts, count) for count in config.iterations}
     entry: dict[str, object] = {
@@ -209,9 +209,12 @@ def main(arguments: list[str] | None = None) -> None:
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     for chatty in ("torch.onnx", "onnxscript", "onnx_ir"):
         logging.getLogger(chatty).setLevel(logging.ERROR)
-    run = read_run(given.run)
-    int8_clips = None if given.int8 is None else ClipPool(given.int8)
-    export_run(run, load_config(run.config_name), given.out, int8_clips=int8_clips)
+    try:
+        run = read_run(given.run)
+        int8_clips = None if given.int8 is None else ClipPool(given.int8)
+        export_run(run, load_config(run.config_name), given.out, int8_clips=int8_clips)
+    except (ConfigError, FileNotFoundError, RunError) as error:
+        sys.exit(f"vergence_models.export: {error}")
 
 
 if __name__ == "__main__":

@@ -137,8 +137,8 @@ def expected(scores: Tensor, values: Tensor) -> Tensor:
 
 
 def conv(inputs: int, outputs: int, *, kernel: int = 3, stride: int = 1) -> nn.Conv2d:
-    """A padded convolution with He initialisation and no bias offset."""
-    layer = nn.Conv2d(inputs, outputs, kernel, stride, padding=kernel // 2)
+    """A convolution with He initialisation and no bias offset; padded if its kernel is odd."""
+    layer = nn.Conv2d(inputs, outputs, kernel, stride, padding=kernel // 2 if kernel % 2 else 0)
     nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
     nn.init.zeros_(layer.bias)  # type: ignore[arg-type]  # bias=True above
     return layer

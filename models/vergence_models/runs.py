@@ -48,6 +48,7 @@ class Run:
     weights: dict[str, Tensor]  # moving average
     story: dict[str, Any]  # any JSON: command, steps, frames, minutes, device, seed
     measured: dict[str, Any]  # any JSON: the last validation
+    source: str = "a run"  # the file it came from
 
 
 def save_checkpoint(folder: Path, contents: dict[str, Any]) -> None:
@@ -132,12 +133,12 @@ def require_same_network(contents: dict[str, Any], config: Config, path: Path) -
 def read_run(folder: Path) -> Run:
     """Load a run for export or evaluation. Raises RunError."""
     contents = load_checkpoint(folder, parts=["average"])
+    source = str(folder / CHECKPOINT_NAME)
     return Run(
         config_name=contents["config"],
-        network=network_from_dict(
-            contents["config"], contents["network"], str(folder / CHECKPOINT_NAME)
-        ),
+        network=network_from_dict(contents["config"], contents["network"], source),
         weights=contents["average"],
         story=contents["story"],
         measured=contents["measured"],
+        source=source,
     )

@@ -81,6 +81,9 @@ def write_with_shared_weights(models: Mapping[Path, ModelProto], weights: Path) 
 
     Tensors of one name are taken to be the same in all ``models``, as :func:`stitched` has them.
     """
+    models = {
+        path: ModelProto.FromString(model.SerializeToString()) for path, model in models.items()
+    }
     places: dict[str, tuple[int, int]] = {}
     with weights.open("wb") as file:
         for model in models.values():

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from vergence_models.runs import Run
 from vergence_models.stepping import Image, Plane, State, SteppedNetwork
-from vergence_models.tiers import build_network
+from vergence_models.tiers import trained_network
 from vergence_proto.model_io import ModelCard
 
 
@@ -17,8 +17,7 @@ class TorchNetwork(SteppedNetwork):
 
     def __init__(self, run: Run, *, threads: int = 2) -> None:
         torch.set_num_threads(threads)
-        self._network = build_network(run.network).eval()
-        self._network.load_state_dict(run.weights)
+        self._network = trained_network(run)
         self.card = ModelCard(
             name=run.config_name,
             stride=run.network.stride,

@@ -29,7 +29,7 @@ import torch
 from vergence_models.config import CONFIGS, load_config
 from vergence_models.data.pool import ClipPool
 from vergence_models.feeding import batches
-from vergence_models.runs import CHECKPOINT_NAME
+from vergence_models.runs import CHECKPOINT_NAME, RunError
 from vergence_models.trainer import Trainer, learning_rate
 from vergence_models.validation import save_picture, validate
 
@@ -141,7 +141,10 @@ def main(arguments: list[str] | None = None) -> None:
     config = dataclasses.replace(config, training=dataclasses.replace(config.training, **changed))
     trainer = Trainer(config, torch.device(given.device))
     if given.resume:
-        trainer.resume(given.out)
+        try:
+            trainer.resume(given.out)
+        except RunError as error:
+            sys.exit(f"vergence_models.train: {error}")
     elif (given.out / CHECKPOINT_NAME).exists():
         sys.exit(f"{given.out} already holds a run; add --resume or choose another folder")
     given.out.mkdir(parents=True, exist_ok=True)

@@ -21,7 +21,7 @@ from vergence_models.runs import (
     require_same_network,
     save_checkpoint,
 )
-from vergence_models.tiers import AnyNetwork, build_network
+from vergence_models.tiers import AnyNetwork, build_network, load_weights
 
 
 def learning_rate(config: Config, step: int) -> float:
@@ -101,7 +101,7 @@ class Trainer:
         """Go on from a run's checkpoint. Raises RunError if it is of another configuration."""
         contents = load_checkpoint(folder)
         require_same_network(contents, self.config, folder / CHECKPOINT_NAME)
-        self.network.load_state_dict(contents["weights"])
+        load_weights(self.network, contents["weights"], str(folder / CHECKPOINT_NAME))
         self.average = {k: v.to(self.device) for k, v in contents["average"].items()}
         self.optimizer.load_state_dict(contents["optimizer"])
         self.random.bit_generator.state = contents["random"]

@@ -15,7 +15,7 @@ from vergence_models import calibrate, export
 from vergence_models.evaluate import WEIGHTS
 from vergence_models.export import shifted_pair
 from vergence_models.runs import read_run
-from vergence_models.tiers import AnyNetwork, build_network
+from vergence_models.tiers import AnyNetwork, trained_network
 from vergence_proto.geometry import Pose, uvd_curr_from_prev
 from vergence_proto.model_io import MANIFEST_NAME
 from vergence_service.model import OnnxStereoModel
@@ -60,8 +60,7 @@ def by_pytorch(network: AnyNetwork) -> list[NDArray[np.float32]]:
 
 async def test_streamed_equals_pytorch_frame_by_frame() -> None:
     run = read_run(RUN)
-    network = build_network(run.network).eval()
-    network.load_state_dict(run.weights)
+    network = trained_network(run)
     model = OnnxStereoModel(WEIGHTS, "lite", providers=["cpu"], threads=2, allow_spinning=False)
     exact = OutputFormat(encoding=PlaneEncoding.FLOAT32)
     async with (

@@ -17,7 +17,13 @@ from vergence_models.data.pool import ClipPool, write_shard
 from vergence_models.feeding import batches
 from vergence_models.losses import doubt_loss
 from vergence_models.motion import perturbed, uvd_transforms
-from vergence_models.runs import CHECKPOINT_NAME, RunError, load_checkpoint, read_run
+from vergence_models.runs import (
+    CHECKPOINT_NAME,
+    RunError,
+    load_checkpoint,
+    read_run,
+    save_checkpoint,
+)
 from vergence_models.train import main
 from vergence_models.trainer import Trainer
 from vergence_models.validation import predict, validate
@@ -88,6 +94,11 @@ def test_another_configuration_is_refused_by_file_and_expectation(tmp_path: Path
     other = dataclasses.replace(SMALL, network=dataclasses.replace(NETWORK, hidden=16))
     with pytest.raises(RunError, match=rf"{CHECKPOINT_NAME}: expected hidden = 16, the run has 32"):
         Trainer(other, torch.device("cpu")).resume(tmp_path)
+    contents = load_checkpoint(tmp_path)
+    del contents["weights"]["update.out.bias"]
+    save_checkpoint(tmp_path, contents)
+    with pytest.raises(RunError, match=rf"{CHECKPOINT_NAME}: .*update.out.bias is missing"):
+        Trainer(SMALL, torch.device("cpu")).resume(tmp_path)
     renamed = dataclasses.replace(SMALL, name="full")
     with pytest.raises(RunError, match="expected a run of configuration 'full', got 'lite'"):
         Trainer(renamed, torch.device("cpu")).resume(tmp_path)

@@ -52,7 +52,7 @@ class CostFilter(nn.Module):
         width = config.cost_channels
         self.sharpness = nn.Parameter(torch.tensor([6.0, 8.0, 10.0]))
         self.mutual = nn.Parameter(torch.tensor(0.3))
-        self.enter = nn.Conv2d(4, width, 2, stride=2)
+        self.enter = conv(4, width, kernel=2, stride=2)
         self.expected = conv(4, width, kernel=1)
         self.context = conv(config.context_low, width, kernel=1)
         self.down = conv(width, width, stride=2)

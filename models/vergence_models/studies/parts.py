@@ -22,7 +22,7 @@ from vergence_models.lite.network import LiteNetwork
 from vergence_models.runs import RunError, read_run
 from vergence_models.studies.contenders import Training
 from vergence_models.studies.tables import Row, Table, markdown, write_tables
-from vergence_models.tiers import build_network
+from vergence_models.tiers import trained_network
 from vergence_models.validation import validate
 
 COLUMNS = {
@@ -49,13 +49,9 @@ def silenced(*layers: str) -> Callable[[LiteNetwork], None]:
     return silence
 
 
-def prior_unseen(network: LiteNetwork) -> None:
-    network.cost_filter.enter.weight[:, 4] = 0  # the channel that tells where the prior lies
-
-
 def claims_unseen(network: LiteNetwork) -> None:
     network.cost_filter.mutual.zero_()
-    network.cost_filter.enter.weight[:, 7] = 0  # the channel that tells of rivals
+    network.cost_filter.enter.weight[:, 3] = 0  # the channel that tells of rivals
 
 
 def bilinear(network: LiteNetwork) -> None:
@@ -66,7 +62,7 @@ PARTS: dict[str, Callable[[LiteNetwork], None]] = {
     "all of it": lambda network: None,
     "1/8: no learned residual on the scores": silenced("cost_filter.leave"),
     "1/8: scores do not know the image": silenced("cost_filter.context"),
-    "1/8: scores do not know the previous surface": prior_unseen,
+    "1/8: scores do not know the previous surface": silenced("cost_filter.expected"),
     "1/8: no doubt about matches another surface claims": claims_unseen,
     "1/4: no rims, only the surface of 1/8": rims_never_chosen,
     "1/4: no wider view": silenced("refinement.back"),
@@ -81,10 +77,9 @@ def table_of_parts(run_folder: Path, pool: ClipPool, *, clips: int) -> Table:
     run = read_run(run_folder)
     rows = []
     for label, silence in track(PARTS.items(), description="parts"):
-        network = build_network(run.network).eval()
+        network = trained_network(run)
         if not isinstance(network, LiteNetwork):
             raise RunError(f"{run_folder}: expected a run of lite, this is {run.config_name}")
-        network.load_state_dict(run.weights)
         with torch.no_grad():
             silence(network)
         figures = validate(network, pool, torch.device("cpu"), clips=clips)
