@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Sequence
+from operator import itemgetter
 
 import numpy as np
 import pytest
@@ -165,20 +166,28 @@ async def test_lanes_are_filled_as_steps_arrive_and_taken_by_one_step_each() -> 
     assert set(model.batches) == {1}
 
 
-async def test_no_stream_is_overtaken_in_lanes() -> None:
-    """A stream whose frame was taken goes to the end of the queue; others' frames come first."""
-    model, taken = RecallModel(lanes=2), list[int]()
+class TickingClock(ManualClock):
+    """A second passes whenever it is read, so that no two moments are the same."""
+
+    def __call__(self) -> float:
+        self.advance(1.0)
+        return self.now_s
+
+
+@pytest.mark.parametrize("lanes", [1, 2, 3])
+async def test_no_stream_is_overtaken_by_another(lanes: int) -> None:
+    clock = TickingClock()
+    taken: list[tuple[float, float]] = []  # when a step arrived, and when the model took it
 
     async def keep_stepping(stream: int) -> None:
         for _ in range(20):
-            await batcher.step(make_step(stream), live_stream=str(stream))
-            taken.append(stream)
+            since_s = clock.now_s + 1.0  # what the batcher is about to read
+            timed = await batcher.step(make_step(stream), live_stream=str(stream))
+            taken.append((since_s, since_s + timed.queue_s))
 
-    async with make_batcher(model) as batcher:
+    async with make_batcher(RecallModel(lanes=lanes), max_batch=1, clock=clock) as batcher:
         await asyncio.gather(*map(keep_stepping, range(5)))
-    for turn in range(2, 19):  # two lanes may end in any order
-        counts = [taken[: 5 * turn].count(stream) for stream in range(5)]
-        assert max(counts) - min(counts) <= 2
+    assert [since_s for since_s, _ in sorted(taken, key=itemgetter(1))] == sorted(dict(taken))
 
 
 @pytest.mark.parametrize("bad", [RAISES, NOT_FINITE])
