@@ -25,7 +25,9 @@ from vergence_models.warp import cell_centres
 BIN_PX = 4  # spacing of the coarse disparities
 REACH = 2  # entries looked up on either side of the current disparity
 TAPS = 2 * REACH + 1
-CELL_INPUTS = TAPS + 9  # what the cell sees besides the context
+FILLS = 3  # surfaces that the surroundings suggest: the smooth, the farthest, the nearest one
+HYPOTHESES = 2 + FILLS  # with the current disparity and the best of the scores
+CELL_INPUTS = TAPS + 2 * FILLS + 5  # what the cell sees besides the context
 MIN_PX = 0.1  # no answer is nearer to infinity
 
 
@@ -138,11 +140,23 @@ def far_fill(d: Tensor, confidence: Tensor, otherwise: Tensor) -> Tensor:
 
     Mostly along the row; ``otherwise`` where no neighbour is confident. All [B, 1, H, W].
     """
-    doubtful = d + 1e3 * (confidence < 0.5).to(d.dtype)
-    near = -F.max_pool2d(-doubtful, (3, 9), stride=1, padding=(1, 4))
-    wide = -F.max_pool2d(-near, (3, 9), stride=1, padding=(1, 4))
-    found = torch.where(near < 1e3, near, wide)
-    return torch.where(found < 1e3, found, otherwise)
+    farthest = -nearest_along_row(-d - 1e3 * (confidence < 0.5).to(d.dtype), above=-1e3)
+    return torch.where(farthest < 1e3, farthest, otherwise)
+
+
+def near_fill(d: Tensor, confidence: Tensor, otherwise: Tensor) -> Tensor:
+    """The nearest surface among confident neighbours: what a blank or thin object is part of.
+
+    As :func:`far_fill`.
+    """
+    nearest = nearest_along_row(d * (confidence >= 0.5).to(d.dtype), above=0)
+    return torch.where(nearest > 0, nearest, otherwise)
+
+
+def nearest_along_row(d: Tensor, *, above: float) -> Tensor:
+    """The largest within 3x9 cells, and where none is ``above``, within 5x17."""
+    near = F.max_pool2d(d, (3, 9), stride=1, padding=(1, 4))
+    return torch.where(near > above, near, F.max_pool2d(near, (3, 9), stride=1, padding=(1, 4)))
 
 
 def beyond(d: Tensor, *, scale: int) -> Tensor:
@@ -161,7 +175,7 @@ class CoarseUpdate(nn.Module):
         super().__init__()
         self.cell = GatedCell(config.hidden, 64 - config.hidden, kernel=1)
         self.head = conv(config.hidden, config.hidden, kernel=1)
-        self.out = silent(conv(config.hidden, 5, kernel=1))
+        self.out = silent(conv(config.hidden, HYPOTHESES + 1, kernel=1))
 
     def forward(
         self,
@@ -169,15 +183,13 @@ class CoarseUpdate(nn.Module):
         d: Tensor,
         *,
         guess: tuple[Tensor, Tensor],
-        fill: Tensor,
-        far: Tensor,
+        fills: Tensor,
         hole: Tensor,
         scores: Volume,
         context: Tensor,
     ) -> tuple[Tensor, Tensor, Hypotheses]:
         """Hidden state and disparity [B, 1, H, W] px to the next ones; what was chosen among."""
         guess_px, guess_log = guess
-        fills = torch.cat((fill, far), dim=1)
         top = scores.scores.amax(dim=-1)[:, None]
         around = lookup_row(scores, coarse_position(d, scores.last), REACH)
         at_fills = lookup(scores, coarse_position(fills, scores.last))
@@ -197,9 +209,9 @@ class CoarseUpdate(nn.Module):
         hidden = self.cell(hidden, inputs)
         learned = self.out(F.relu(self.head(hidden)))
         # Fixed part of the choice: the score itself, and a doubt about guesses that are not unique.
-        kept, at_fill, at_far = (log_p[:, k : k + 1] for k in (REACH, TAPS, TAPS + 1))
-        fixed = torch.cat((kept + 1, 2 * guess_log, at_fill - 1, at_far - 1), dim=1)
+        kept, at_fills = log_p[:, REACH : REACH + 1], log_p[:, TAPS:]
+        fixed = torch.cat((kept + 1, 2 * guess_log, at_fills - 1), dim=1)
         surfaces = torch.cat((d, guess_px, fills), dim=1)
-        hypotheses = Hypotheses(surfaces, fixed + 4 * learned[:, :4])
-        d = (hypotheses.mean() + 4 * learned[:, 4:]).clamp(min=MIN_PX)
+        hypotheses = Hypotheses(surfaces, fixed + 4 * learned[:, :HYPOTHESES])
+        d = (hypotheses.mean() + 4 * learned[:, HYPOTHESES:]).clamp(min=MIN_PX)
         return hidden, d, hypotheses

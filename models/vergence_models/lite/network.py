@@ -28,6 +28,7 @@ from vergence_models.lite.coarse import (
     CoarseUpdate,
     CostFilter,
     far_fill,
+    near_fill,
     peak,
     smooth_fill,
 )
@@ -167,13 +168,12 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         guess = peak(scores)
         confidence = torch.exp(4 * guess[1])
         fill = smooth_fill(guess[0], confidence)
-        far = far_fill(guess[0], confidence, fill)
+        far, near = (each(guess[0], confidence, fill) for each in (far_fill, near_fill))
         hidden, d, hypotheses = self.update(
             hidden,
             prior8 + hole8 * (fill - prior8),
             guess=guess,
-            fill=fill,
-            far=far,
+            fills=torch.cat((fill, far, near), dim=1),
             hole=hole8,
             scores=scores,
             context=evidence.context8,
