@@ -50,8 +50,8 @@ class CensusDescriptor(nn.Module):
 
 def all_pairs(left: Tensor, right: Tensor) -> Tensor:
     """Mean product of descriptors along each row: [B, C, H, W] x [B, C, H, W'] -> [B, H, W, W']."""
-    scaled = left.permute(0, 2, 1, 3).transpose(2, 3) * (1 / left.shape[1])
-    return torch.matmul(scaled, right.permute(0, 2, 1, 3))
+    rows, other = (each.permute(0, 2, 3, 1) for each in (left, right))
+    return torch.matmul(rows * (1 / left.shape[1]), other.transpose(2, 3))
 
 
 def banded(pairs: Tensor, disparities: int) -> Tensor:

@@ -27,8 +27,9 @@ def cell_centres(height: int, width: int, scale: int, like: Tensor) -> tuple[Ten
 
 def transform_uvd(matrix: Tensor, u: Tensor, v: Tensor, d: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Apply ``matrix`` [B, 4, 4] to (u, v, d, 1), each [B, H, W]; points behind give d = 0."""
-    m = matrix[:, :, :, None, None]
-    x, y, z, w = (m[:, i, 0] * u + m[:, i, 1] * v + m[:, i, 2] * d + m[:, i, 3] for i in range(4))
+    points = torch.stack((u.expand_as(d), v.expand_as(d), d, torch.ones_like(d)), dim=1)
+    moved = torch.matmul(matrix, points.flatten(2)).view(points.shape)
+    x, y, z, w = (moved[:, row] for row in range(4))
     in_front = (w > 1e-3).to(d.dtype)
     scale = in_front / w.clamp(min=1e-3)
     return x * scale, y * scale, z * scale

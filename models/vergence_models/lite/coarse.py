@@ -35,7 +35,7 @@ class Clues(NamedTuple):
     """What the scores of the wide search are made of, as far as two images alone say it."""
 
     fixed: Tensor  # [B, D, H, W] at 1/8, largest disparity first: scores before anything learned
-    features: Tensor  # [B, D, C, H/2, W/2]: what the learned filter sees of them
+    features: Tensor  # [B D, C, H/2, W/2]: what the learned filter sees of them
 
 
 class CostFilter(nn.Module):
@@ -74,7 +74,6 @@ class CostFilter(nn.Module):
         channels = (narrow, middle, lead.clamp(min=-1), claim.clamp(min=-1))
         stacked = torch.stack(channels, dim=2)
         features = self.enter(stacked.reshape(batch * bins, len(channels), height, width))
-        features = features.view(batch, bins, -1, height // 2, width // 2)
         return Clues(fixed + 10 * self.mutual * claim, features)
 
     def forward(self, clues: Clues, context: Tensor, prior: Tensor) -> Tensor:
@@ -82,21 +81,16 @@ class CostFilter(nn.Module):
         batch, bins, height, width = clues.fixed.shape
         # Where nothing is expected, nothing is near.
         expected_px = F.pixel_unshuffle(prior - (prior <= 0).to(prior.dtype) * 1e3, 2)
-        bin_px = disparities(bins, prior)[:, :, None]
-        near = (1 - (expected_px[:, None] - bin_px).abs() * (0.5 / BIN_PX)).clamp(min=0)
-        near = self.expected(near.view(batch * bins, 4, height // 2, width // 2))
-        x = clues.features + near.view_as(clues.features) + context[:, None]
+        bin_px = torch.arange(bins - 1, -1, -1, device=prior.device).to(prior.dtype) * BIN_PX
+        apart_px = expected_px.reshape(batch, 1, -1) - bin_px[:, None]
+        near = (1 - apart_px.abs() * (0.5 / BIN_PX)).clamp(min=0)
+        x = clues.features + self.expected(near.view(-1, 4, height // 2, width // 2))
+        x = x.view(batch, bins, -1, height // 2, width // 2) + context[:, None]
         x = F.relu6(x).view(batch * bins, -1, height // 2, width // 2)
         low = F.relu6(self.low(F.relu6(self.down(x))))
         x = F.relu6(self.middle(x + enlarge(low)))
         residual = F.pixel_shuffle(self.leave(x), 2).view(batch, bins, height, width)
         return (clues.fixed + residual).permute(0, 2, 3, 1)
-
-
-def disparities(bins: int, like: Tensor) -> Tensor:
-    """Those that the coarse scores stand for, px, [1, D, 1, 1]."""
-    px = torch.arange(bins - 1, -1, -1, device=like.device).to(like.dtype) * BIN_PX
-    return px[None, :, None, None]
 
 
 def coarse_position(d: Tensor, last: int) -> Tensor:
@@ -135,28 +129,20 @@ def smooth_fill(d: Tensor, confidence: Tensor) -> Tensor:
     return total[:, :1] / total[:, 1:]
 
 
-def far_fill(d: Tensor, confidence: Tensor, otherwise: Tensor) -> Tensor:
-    """The farthest surface among confident neighbours: what an occluded cell shows.
+def extremes(d: Tensor, confidence: Tensor, otherwise: Tensor) -> Tensor:
+    """The farthest and the nearest surface among confident neighbours, [B, 2, H, W].
 
-    Mostly along the row; ``otherwise`` where no neighbour is confident. All [B, 1, H, W].
+    The farthest is what an occluded cell shows, the nearest what a blank or thin thing is part of.
+    Mostly along the row; ``otherwise`` where no neighbour is confident.
     """
-    farthest = -nearest_along_row(-d - 1e3 * (confidence < 0.5).to(d.dtype), above=-1e3)
-    return torch.where(farthest < 1e3, farthest, otherwise)
-
-
-def near_fill(d: Tensor, confidence: Tensor, otherwise: Tensor) -> Tensor:
-    """The nearest surface among confident neighbours: what a blank or thin object is part of.
-
-    As :func:`far_fill`.
-    """
-    nearest = nearest_along_row(d * (confidence >= 0.5).to(d.dtype), above=0)
-    return torch.where(nearest > 0, nearest, otherwise)
-
-
-def nearest_along_row(d: Tensor, *, above: float) -> Tensor:
-    """The largest within 3x9 cells, and where none is ``above``, within 5x17."""
-    near = F.max_pool2d(d, (3, 9), stride=1, padding=(1, 4))
-    return torch.where(near > above, near, F.max_pool2d(near, (3, 9), stride=1, padding=(1, 4)))
+    doubt = 1e3 * (confidence < 0.5).to(d.dtype)
+    both = torch.cat((-d - doubt, d - doubt), dim=1)
+    beside = F.max_pool2d(both, (3, 9), stride=1, padding=(1, 4))
+    wide = F.max_pool2d(beside, (3, 9), stride=1, padding=(1, 4))
+    # A disparity is below 500 px, and what is doubtful above it.
+    found = torch.where(beside > -500, beside, wide)
+    signed = torch.cat((-found[:, :1], found[:, 1:]), dim=1)
+    return torch.where(found > -500, signed, otherwise)
 
 
 def beyond(d: Tensor, *, scale: int) -> Tensor:

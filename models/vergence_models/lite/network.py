@@ -27,8 +27,7 @@ from vergence_models.lite.coarse import (
     Clues,
     CoarseUpdate,
     CostFilter,
-    far_fill,
-    near_fill,
+    extremes,
     peak,
     smooth_fill,
 )
@@ -111,6 +110,7 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         self.update = CoarseUpdate(config)
         self.refinement = Refinement(config)
         self.near = near_columns(config.max_disparity_px)
+        self.bins = config.max_disparity_px // BIN_PX
 
     @property
     def state_tensors(self) -> tuple[StateTensor, ...]:
@@ -147,7 +147,7 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         pairs = all_pairs(
             self.coarse_descriptor(gray(left, 4), 2), self.coarse_descriptor(gray(right, 4), 1)
         )
-        return self.cost_filter.clues(banded(pairs, self.config.max_disparity_px // BIN_PX))
+        return self.cost_filter.clues(banded(pairs, self.bins))
 
     def search_narrow(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Pairs at 1/4, and the context: what :class:`Evidence` holds besides the clues."""
@@ -168,12 +168,11 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         guess = peak(scores)
         confidence = torch.exp(4 * guess[1])
         fill = smooth_fill(guess[0], confidence)
-        far, near = (each(guess[0], confidence, fill) for each in (far_fill, near_fill))
         hidden, d, hypotheses = self.update(
             hidden,
             prior8 + hole8 * (fill - prior8),
             guess=guess,
-            fills=torch.cat((fill, far, near), dim=1),
+            fills=torch.cat((fill, extremes(guess[0], confidence, fill)), dim=1),
             hole=hole8,
             scores=scores,
             context=evidence.context8,

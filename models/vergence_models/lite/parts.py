@@ -83,7 +83,7 @@ def parts_of(network: LiteNetwork) -> Parts[Part]:
     moving = tuple(f"at_{name}" for name in LiteState._fields)  # outputs have the plain names
     sizes_of: dict[str, Sizes] = {
         "fixed": cells(stride, 8),
-        "features": {0: BATCH, 3: stride // 16 * ROWS, 4: stride // 16 * COLUMNS},
+        "features": {**cells(stride, 16), 0: network.bins * BATCH},
         "pairs": {0: BATCH, 1: stride // 4 * ROWS, 3: window, 4: stride // 32 * COLUMNS},
         "context4": cells(stride, 4),
         "context8": cells(stride, 8),

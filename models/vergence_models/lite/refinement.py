@@ -54,8 +54,8 @@ class Refinement(nn.Module):
     def __init__(self, config: LiteNetworkConfig) -> None:
         super().__init__()
         width = config.fine_channels
-        self.hidden = conv(config.hidden, 16, kernel=1)
-        self.first = conv(config.context_quarter + 16 + 4 * SURFACES, width, kernel=1)
+        self.hidden = conv(config.hidden, width, kernel=1)
+        self.first = conv(config.context_quarter + 4 * SURFACES, width, kernel=1)
         self.down = conv(width, config.fine_low, stride=2)
         self.low = conv(config.fine_low, config.fine_low)
         self.lower = conv(config.fine_low, config.fine_low)
@@ -93,9 +93,8 @@ class Refinement(nn.Module):
         cost = lookup(pairs, position(surfaces))
         wide = box3(cost)
         apart = squash(torch.cat((surfaces[:, 1:], carried), dim=1) - plain, 2.0)
-        up = enlarge(self.hidden(hidden))
         told = torch.cat((cost, wide, apart, beyond(surfaces, scale=4)), dim=1)
-        x = F.relu(joint(self.first, context, up, told))
+        x = F.relu(joint(self.first, context, told) + enlarge(self.hidden(hidden)))
         # Where an object ends shows in a wider view than 3x3 cells.
         low = F.relu6(self.lower(F.relu6(self.low(F.relu6(self.down(x))))))
         x = F.relu(x + enlarge(self.back(low)))
