@@ -93,8 +93,11 @@ class Config:
     iterations: tuple[int, ...] = (1, 2, 4, 8)  # graphs to export
 
 
-# Windows of a sharper camera need less blowing up; a stereo pair alone has to be good too.
-LITE_TRAINING = TrainingConfig(frames=6, decay_steps=22_000, stretch_share=0.3, reset_share=0.15)
+# Windows of a sharper camera need less blowing up; a stereo pair alone has to be good too, with
+# more iterations than a stream starts with.
+LITE_TRAINING = TrainingConfig(
+    frames=6, decay_steps=29_000, stretch_share=0.3, reset_share=0.25, cold_iterations=6
+)
 # The paper's: Adam, no weight decay, an L1 loss that weighs every frame alike.
 RAFT_TRAINING = TrainingConfig(
     learning_rate=4e-4, weight_decay=0.0, cold_iterations=6, precision=Precision.BF16

@@ -53,7 +53,7 @@ class Evidence(NamedTuple):
     """What two images say by themselves: made once, whatever the iterations."""
 
     clues: Clues
-    pairs: Tensor  # [B, H/4, W/4, N]: correlation at 1/4
+    pairs: Tensor  # at 1/4, see Near.pairs
     context4: Tensor  # [B, C, H/4, W/4]
     context8: Tensor
     context16: Tensor  # as the cost filter takes it
