@@ -73,36 +73,36 @@ def fill_cracks(d: Tensor) -> Tensor:
     return torch.where((filled < 0.5) & (both[:, 1] > 0.5), mean, d)
 
 
-def sample_bilinear(features: Tensor, column: Tensor, row: Tensor) -> Tensor:
-    """Bilinear samples of ``features`` [B, C, H, W] at float cells [B, H', W'], clamped.
+def sample_bilinear(plane: Tensor, column: Tensor, row: Tensor) -> Tensor:
+    """Bilinear samples of ``plane`` [B, H, W] at float cells [B, H', W'], clamped.
 
     Four gathers instead of grid_sample, which is thirty times slower under onnxruntime.
     """
-    batch, channels, height, width = features.shape
+    height, width = plane.shape[1:]
     x = column.clamp(0, width - 1)
     y = row.clamp(0, height - 1)
     x0, y0 = torch.floor(x), torch.floor(y)
-    rows = features.flatten(2).transpose(1, 2)  # the channels of a cell side by side
     terms = []
     for dy, dx in itertools.product((0, 1), repeat=2):
         share = (1 - (x - x0 - dx).abs()) * (1 - (y - y0 - dy).abs())
         cell = (y0 + dy).clamp(max=height - 1) * width + (x0 + dx).clamp(max=width - 1)
-        terms.append(rows_at(rows, cell.flatten(1).long()) * share.flatten(1)[:, :, None])
-    sampled = functools.reduce(torch.add, terms)
-    return sampled.transpose(1, 2).view(batch, channels, column.shape[1], column.shape[2])
+        picked = plane.flatten(1).gather(1, cell.flatten(1).long())
+        terms.append(picked.view(column.shape) * share)
+    return functools.reduce(torch.add, terms)
 
 
-def rows_at(rows: Tensor, index: Tensor) -> Tensor:
-    """Those of ``rows`` [B, N, C] with an ``index`` [B, M]: [B, M, C].
+def sample_nearest(features: Tensor, column: Tensor, row: Tensor) -> Tensor:
+    """Those of ``features`` [B, C, H, W] nearest to float cells [B, H', W'], clamped.
 
-    onnxruntime gathers single elements quickest one by one, and more of them as slices.
+    The channels of a cell side by side, so that each is one copy.
     """
-    batch, count, channels = rows.shape
-    if channels == 1:
-        return rows.gather(1, index[:, :, None])
-    first = torch.arange(batch, device=rows.device)[:, None] * count
-    picked = rows.reshape(batch * count, channels).index_select(0, (index + first).flatten())
-    return picked.view(batch, index.shape[1], channels)
+    batch, channels, height, width = features.shape
+    x = torch.floor(column + 0.5).clamp(0, width - 1)
+    y = torch.floor(row + 0.5).clamp(0, height - 1)
+    first = torch.arange(batch, device=features.device)[:, None, None] * (height * width)
+    index = (y * width + x).long() + first
+    picked = features.permute(0, 2, 3, 1).reshape(-1, channels).index_select(0, index.flatten())
+    return picked.view(*index.shape, channels).permute(0, 3, 1, 2)
 
 
 def splat_softmax(values: Tensor, column: Tensor, row: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
@@ -174,8 +174,8 @@ def warp_state(
 
     Forward splat of the one-channel disparity finds which surface is seen where; from there each
     cell looks back through the inverse transform and takes the disparity between cells and the
-    hidden state of the place it came from. So the many channels are gathered, never splatted, and
-    rounding to cells costs no accuracy.
+    hidden state of the cell it came from. So the many channels are gathered, never splatted, and
+    rounding to cells costs the disparity no accuracy.
 
     Args: ``disparity`` [B, 1, H/s, W/s] px at full resolution, 0 = nothing; ``hidden``
     [B, C, H/s', W/s']; ``uvd_curr_from_prev`` [B, 4, 4]. Returns prior disparity [B, 1, H/s, W/s]
@@ -197,7 +197,7 @@ def warp_state(
     u_from, v_from, d_from = transform_uvd(prev_from_curr, u, v, landed)
     source_column = (u_from + 0.5) / scale - 0.5
     source_row = (v_from + 0.5) / scale - 0.5
-    between = sample_bilinear(disparity, source_column, source_row)[:, 0]
+    between = sample_bilinear(previous, source_column, source_row)
     # Between two surfaces the bilinear sample belongs to neither: keep what was splatted.
     smooth = ((between - d_from).abs() < 1.0).to(landed.dtype)
     _, _, refined = transform_uvd(uvd_curr_from_prev, u_from, v_from, between)
@@ -208,7 +208,7 @@ def warp_state(
     low_seen = (low > MIN_DISPARITY_PX).to(low.dtype)[:, None]
     u_low, v_low = cell_centres(low.shape[1], low.shape[2], hidden_scale, low)
     u_low, v_low, _ = transform_uvd(prev_from_curr, u_low, v_low, low)
-    carried = sample_bilinear(
+    carried = sample_nearest(
         hidden, (u_low + 0.5) / hidden_scale - 0.5, (v_low + 0.5) / hidden_scale - 0.5
     )
     return prior[:, None], carried * low_seen

@@ -123,8 +123,8 @@ class Refinement(nn.Module):
         return Refined(d, out[:, 2:], x), hypotheses
 
     def enlarged(self, found: Refined) -> tuple[Tensor, Tensor]:
-        """Full-size disparity and sigma, px [B, H, W]."""
+        """Full-size disparity and sigma, px [B, H, W]; sigma is that of cells of 4x4 pixels."""
         # Half a pixel at first; within e^-3.5 and e^4 times that.
         sigma = 0.5 * torch.exp((4 * found.doubt).clamp(-3.5, 4.0))
         full = self.upsample(found.features, found.disparity)
-        return full, F.interpolate(sigma, scale_factor=4.0, mode="bilinear").squeeze(1)
+        return full, sigma[:, 0, :, None, :, None].expand(-1, -1, 4, -1, 4).reshape(full.shape)
