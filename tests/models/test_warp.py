@@ -68,7 +68,8 @@ def test_true_pose_and_disparity_reproduce_the_next_view(name: str) -> None:
     assert error.mean() < 0.01
     assert error.quantile(0.99) < 0.05
 
-    # The hidden state holds its own column: it must have come from where the geometry says.
+    # The hidden state holds its own column: it must have come from the cell that lies nearest to
+    # where the geometry says.
     u, v = cell_centres(HEIGHT // 8, WIDTH // 8, 8, prior)
     back = torch.linalg.inv(matrix.double()).float()
     u_from, _, _ = transform_uvd(back, u, v, wall_disparity(world_from_curr, 8))
@@ -77,7 +78,7 @@ def test_true_pose_and_disparity_reproduce_the_next_view(name: str) -> None:
     inside[:, :2] = inside[:, -2:] = False
     known = inside & (hidden[:, 0] > 0)
     assert known.float().mean() > 0.6
-    assert (hidden[:, 0] - expected).abs()[known].mean() < 0.05
+    assert (hidden[:, 0] - torch.floor(expected + 0.5)).abs()[known].mean() < 0.05
 
 
 @pytest.mark.parametrize("name", MOTIONS)
