@@ -144,8 +144,8 @@ def write_model(
 
     A step with one graph in ``begin`` stays whole: one call is simple to serve, and nothing is
     handed from graph to graph. With the weights shared, five counts take little more room than one.
-    Of `fast` on two busy cores: 1.32 s against 1.41 s at one iteration, 2.04 s against 2.41 s at
-    five; 9.5 MB where five whole graphs would take 43.6 (``tests/benchmarks/graph_parts.py``).
+    Of `fast` on two cores: 162 ms against 198 at one iteration, 259 against 301 at five; 9.5 MB
+    where five whole graphs would take 43.6 (``tests/benchmarks/graph_parts.py --model fast``).
     """
     out.mkdir(parents=True, exist_ok=True)
     if len(parts.begin) == 1:

@@ -77,8 +77,7 @@ class Refinement(nn.Module):
     ) -> tuple[Refined, Hypotheses]:
         """Choose and fit. Hypotheses are the surface of 1/8 and its rims.
 
-        Volume at 1/4; px at 1/8 and, 0 where unknown, at 1/4; hidden state at
-        1/8, context at 1/4.
+        Volume at 1/4; px at 1/8 and, 0 where unknown, at 1/4; hidden state at 1/8, context at 1/4.
         """
         u, _ = cell_centres(prior.shape[2], prior.shape[3], 4, prior)
         column = (u - 1.5) * (1 / FINE_PX)
