@@ -9,9 +9,10 @@ export, ``weights-*`` and ``optimizer-*`` to go on. ``log.jsonl`` has a line for
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from vergence_models.config import Config, ConfigError, NetworkConfig, network_f
 from vergence_models.pieces import HALF, PIECE_BYTES, joined, split, tensors_of
 
 CHECKPOINT_NAME = "checkpoint.pt"
+LOG_NAME = "log.jsonl"
 WHOLE_FORMAT = 1  # everything in one file
 PIECES_FORMAT = 2  # an index, and the large tensors beside it
 
@@ -39,6 +41,14 @@ class Progress:
     minutes: float = 0.0
 
 
+@dataclass(frozen=True, slots=True)
+class Validation:
+    """What validation found after so many steps: errors by name, as ``validate`` gives them."""
+
+    steps: int
+    measured: dict[str, float]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Run:
     """The outcome of a run so far: what export and evaluation need."""
@@ -49,6 +59,7 @@ class Run:
     story: dict[str, Any]  # any JSON: command, steps, frames, minutes, device, seed
     measured: dict[str, Any]  # any JSON: the last validation
     source: str = "a run"  # the file it came from
+    history: list[Validation] = field(default_factory=list)
 
 
 def save_checkpoint(folder: Path, contents: dict[str, Any]) -> None:
@@ -141,4 +152,17 @@ def read_run(folder: Path) -> Run:
         story=contents["story"],
         measured=contents["measured"],
         source=source,
+        history=read_history(folder),
     )
+
+
+def read_history(folder: Path) -> list[Validation]:
+    """Every validation in a run's log; none without a log. Raises RunError."""
+    path = folder / LOG_NAME
+    if not path.is_file():
+        return []
+    try:
+        lines = [json.loads(line) for line in path.read_text("utf-8").splitlines()]
+        return [Validation(x["step"], x["validation"]) for x in lines if "validation" in x]
+    except (ValueError, KeyError, TypeError) as error:
+        raise RunError(f"{path}: expected a line of JSON for every report: {error!r}") from None

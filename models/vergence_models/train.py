@@ -29,7 +29,7 @@ import torch
 from vergence_models.config import CONFIGS, load_config
 from vergence_models.data.pool import ClipPool
 from vergence_models.feeding import batches
-from vergence_models.runs import CHECKPOINT_NAME, RunError
+from vergence_models.runs import CHECKPOINT_NAME, LOG_NAME, RunError
 from vergence_models.trainer import Trainer, learning_rate
 from vergence_models.validation import save_picture, validate
 
@@ -103,7 +103,7 @@ def report(out: Path, trainer: Trainer, recent: list[dict[str, float]]) -> None:
 def write_line(out: Path, values: dict[str, Any]) -> None:
     """Append one JSON line to the run's log and say it."""
     line = json.dumps(values)
-    with (out / "log.jsonl").open("a", encoding="utf-8") as file:
+    with (out / LOG_NAME).open("a", encoding="utf-8") as file:
         file.write(line + "\n")
     log.info("%s", line)
 

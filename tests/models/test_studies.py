@@ -22,6 +22,7 @@ from vergence_models.methods import (
     with_pose_noise,
     without_poses,
 )
+from vergence_models.runs import RunError, read_history, read_run
 from vergence_models.stepping import Footage, SteppedNetwork, footage_from_clip
 from vergence_models.studies.__main__ import main
 from vergence_models.studies.bench import Bench
@@ -31,6 +32,7 @@ from vergence_models.studies.contenders import (
     missing_tiers,
 )
 from vergence_models.studies.footage import SPEEDS, StudySettings
+from vergence_models.studies.learning import learning_curves
 from vergence_models.studies.plan import (
     STUDIES,
     cold_start,
@@ -245,3 +247,18 @@ def test_a_file_that_holds_no_studies_is_not_overwritten(tmp_path: Path) -> None
 
 def test_every_study_has_a_name_of_its_own() -> None:
     assert len({study.__doc__ for study in STUDIES.values()}) == len(STUDIES)
+
+
+def test_learning_curves_are_those_of_the_log(cache: Path, tmp_path: Path) -> None:
+    contenders = gather_contenders([WEIGHTS], [RUN], threads=1)
+    table = learning_curves(new_bench(contenders, cache))
+    assert table.rows[-1].values["warm_epe"] == read_run(RUN).measured["warm_epe"]
+    for curve in table.curves:
+        assert curve.x == sorted(curve.x)
+        assert len(curve.x) == len(curve.epe) > 1
+
+
+def test_a_log_that_is_none_is_named(tmp_path: Path) -> None:
+    (tmp_path / "log.jsonl").write_text('{"step": 1, "validation": {}}\nnot JSON\n')
+    with pytest.raises(RunError, match=r"log\.jsonl: expected a line of JSON"):
+        read_history(tmp_path)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from vergence_models.methods import Method, single_frame_method, warm_method
-from vergence_models.runs import Run, read_run
+from vergence_models.runs import Run, Validation, read_run
 from vergence_models.stepping import OnnxNetwork, SteppedNetwork
 from vergence_models.torch_stepping import TorchNetwork
 from vergence_proto.model_io import MANIFEST_NAME, ManifestError
@@ -61,6 +61,7 @@ class Contender:
     single_frame: tuple[int, ...]
     cold: int  # iterations on the first frame of a warm sequence
     warps: bool  # its state moves with the camera; otherwise poses do not matter to it
+    history: list[Validation] = field(default_factory=list)  # of a run, while it was trained
 
     @property
     def tier(self) -> str:
@@ -120,6 +121,7 @@ def trained(run: Run, beside: Iterable[Contender], *, threads: int) -> Contender
         ),
         cold=COLD,
         warps=dataclasses.asdict(run.network).get("warp", True),
+        history=run.history,
     )
 
 

@@ -17,6 +17,7 @@ from vergence_models.studies.findings import (
     warp_findings,
 )
 from vergence_models.studies.footage import SPEEDS, Group
+from vergence_models.studies.learning import learning_curves
 from vergence_models.studies.tables import EPE_COLUMNS, TIME_COLUMNS, Curve, Row, Table
 from vergence_models.tally import Tally, settled_frame
 
@@ -281,4 +282,5 @@ STUDIES: dict[str, Study] = {
     "noise": pose_noise,
     "cold": cold_start,
     "times": times,
+    "training": learning_curves,
 }

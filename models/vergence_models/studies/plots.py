@@ -32,10 +32,17 @@ def draw(axes: Axes, name: str, table: Table) -> None:
     highest = max(max(curve.epe) for curve in table.curves)
     for curve in table.curves:
         marker = "." if len(curve.x) < 15 else ""
-        axes.plot(curve.x, curve.epe, marker=marker, label=curve.label)
+        style = "--" if curve.dashed else "-"
+        axes.plot(curve.x, curve.epe, style, marker=marker, label=curve.label)
     axes.set(xlabel=table.x_label, ylabel="EPE [px]", title=table.title)
-    axes.set_ylim(0, 1.1 * highest)
-    axes.legend(fontsize=6, loc="lower right")
+    if table.logarithmic:
+        axes.set(xscale="log", yscale="log")
+        for ticks in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
+            ticks("{x:g}")
+        axes.grid(which="both", linewidth=0.3)
+    else:
+        axes.set_ylim(0, 1.1 * highest)
+    axes.legend(fontsize=6, loc="upper right" if table.logarithmic else "lower right")
 
 
 def draw_runtime(axes: Axes, table: Table) -> None:

@@ -27,11 +27,12 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """EPE in px over whatever the study varies."""
+    """EPE in px over whatever the study varies. A dashed one is drawn beside its like."""
 
     label: str
     x: list[float]
     epe: list[float]
+    dashed: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +50,7 @@ class Table:
     paper_note: str = ""
     curves: list[Curve] = field(default_factory=list)
     x_label: str = ""
+    logarithmic: bool = False  # both axes of the curves
 
     @property
     def labels(self) -> list[str]:

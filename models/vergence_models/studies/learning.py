@@ -1,0 +1,54 @@
+"""How far the runs have come, from their own logs: what every other table must be read with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from vergence_models.runs import Validation
+from vergence_models.studies.bench import Bench
+from vergence_models.studies.tables import Curve, Row, Table
+
+COLUMNS = {
+    "cold_epe": "cold EPE",
+    "warm_epe": "warm EPE",
+    "cold_d1": "cold D1 %",
+    "warm_d1": "warm D1 %",
+}
+
+
+def learning_curves(bench: Bench) -> Table:
+    """How far each run has come, and whether it still falls."""
+    runs = [contender for contender in bench.contenders if contender.history]
+    rows, curves = [], []
+    for contender in runs:
+        history = contender.history
+        for point in history_told(history):
+            told = {key: point.measured[key] for key in COLUMNS if key in point.measured}
+            rows.append(Row(f"{contender.name}, {point.steps:,} steps", told))
+        for kind in ("cold", "warm"):
+            steps = [float(point.steps) for point in history]
+            epes = [point.measured[f"{kind}_epe"] for point in history]
+            curves.append(Curve(f"{contender.name}, {kind}", steps, epes, dashed=kind == "cold"))
+    return Table(
+        name="training",
+        title="How far the training has come",
+        text="EPE in px and D1 on the clips each run was validated on while it was trained: *cold* "
+        "on first frames (4 iterations), *warm* on the others (1 iteration). A curve that still "
+        "falls has not been trained long enough; a figure of such a network says where it stands, "
+        "not where it will end.",
+        columns=COLUMNS,
+        rows=rows,
+        training=[contender.training.words for contender in runs],
+        curves=curves,
+        x_label="training steps",
+        logarithmic=True,
+    )
+
+
+def history_told(history: Sequence[Validation]) -> list[Validation]:
+    """The first, the last, and those between that doubled the steps of the one before."""
+    told = list(history[:1])
+    for point in history[1:-1]:
+        if point.steps >= 2 * told[-1].steps and 2 * point.steps <= history[-1].steps:
+            told.append(point)
+    return told + list(history[1:][-1:])
