@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -136,22 +138,28 @@ class SteppedNetwork(ABC):
 
 
 class OnnxNetwork(SteppedNetwork):
-    """The graphs of one model under onnxruntime on the CPU, one after the other."""
+    """The graphs of one model under onnxruntime on the CPU, as the service runs a lone stream's.
+
+    The graphs of a stage run side by side. They share ``threads`` (at least 1), so a model that is
+    cut for as many as there are has no operator on more than one, also in stages of one graph.
+    """
 
     def __init__(self, weights: Path, name: str, *, threads: int = 2) -> None:
         """Raises ManifestError: no such model, or a file of it is damaged."""
         self.card = load_model_card(weights, name)
+        stages = [stage for stages in self.card.graphs.values() for stage in stages]
+        side_by_side = max(map(len, stages))
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        # As the service sets it: threads that always spin cost the other core's time.
+        options.intra_op_num_threads = max(1, threads // side_by_side)
+        # Both as the service sets them: planning the reuse of buffers only slows the start down,
+        # and threads that always spin cost the other core's time.
+        options.enable_mem_reuse = False
         options.add_session_config_entry("session.intra_op.spin_duration_us", "20")
-        graphs = {
-            path for stages in self.card.graphs.values() for stage in stages for path in stage
-        }
         self._sessions = {
             path: onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-            for path in graphs
+            for path in {path for stage in stages for path in stage}
         }
+        self._beside = ThreadPoolExecutor(min(threads, side_by_side))  # ends with this network
 
     def run(
         self,
@@ -164,10 +172,14 @@ class OnnxNetwork(SteppedNetwork):
         given = (left, right, uvd_curr_from_prev, *state)
         # Of any type: what one stage hands the next is the exporter's own business.
         tensors: dict[str, Any] = dict(zip(self.card.input_names, given, strict=True))
+
+        def outputs_of(graph: Path) -> list[tuple[str, Any]]:
+            session = self._sessions[graph]
+            feed = {entry.name: tensors[entry.name] for entry in session.get_inputs()}
+            names = [entry.name for entry in session.get_outputs()]
+            return [*zip(names, session.run(names, feed), strict=True)]
+
         for stage in self.card.graphs[iterations]:
-            for session in (self._sessions[path] for path in stage):
-                feed = {entry.name: tensors[entry.name] for entry in session.get_inputs()}
-                names = [entry.name for entry in session.get_outputs()]
-                tensors |= zip(names, session.run(names, feed), strict=True)
+            tensors |= chain(*[*self._beside.map(outputs_of, stage)])
         disparity, sigma, *following = (tensors[name] for name in self.card.output_names)
         return disparity, sigma, tuple(following)

@@ -1,6 +1,7 @@
 """Graphs stepped by evaluation and studies."""
 
 import numpy as np
+import pytest
 
 from tests.support.weights_copy import WEIGHTS
 from vergence_models.stepping import OnnxNetwork
@@ -8,8 +9,9 @@ from vergence_models.stepping import OnnxNetwork
 HEIGHT, WIDTH = 40, 70
 
 
-def test_stages_answer_bit_for_bit_what_the_whole_graph_answers() -> None:
-    whole, staged = (OnnxNetwork(WEIGHTS, name) for name in ("whole", "staged"))
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_stages_answer_bit_for_bit_what_the_whole_graph_answers(threads: int) -> None:
+    whole, staged = (OnnxNetwork(WEIGHTS, name, threads=threads) for name in ("whole", "staged"))
     random = np.random.default_rng(1)
     state = once = whole.cold_state(HEIGHT, WIDTH, batch=2)
     for iterations in (2, 1, 1):
