@@ -7,7 +7,7 @@ import warnings
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 import onnx
 import torch
@@ -25,6 +25,18 @@ COLUMNS = torch.export.Dim("columns", min=1, max=128)
 # What the exporter takes for a tensor's dynamic sizes: dimension -> a Dim or a multiple of one.
 Sizes = dict[int, object]
 Network = TypeVar("Network", bound=nn.Module)
+
+
+class PartOf(nn.Module, Generic[Network]):
+    """A part of a network's step, from tensors to tensors: ``forward`` is what remains to say."""
+
+    def __init__(self, network: Network) -> None:
+        super().__init__()
+        self.network = network
+
+    def examples(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """What it gives, for the part that takes it."""
+        return tuple(tensor.detach() for tensor in self(*inputs))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

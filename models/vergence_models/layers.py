@@ -1,4 +1,4 @@
-"""The parts of the network: census descriptors, volumes and lookups, the cell, the upsampler.
+"""The parts of the network: census descriptors, volumes, the cell, the upsampler.
 
 Each is written the way onnxruntime runs it fast on a CPU: matrix products and gathers along the
 last axis, exp and sum instead of Softmax, slices instead of unfold, no norm layers. And each starts
@@ -93,21 +93,6 @@ def best_rival(scores: Tensor, ratio: int) -> Tensor:
     again = best[..., : size - 1].expand(-1, groups + 1, -1).reshape(batch, -1)
     rivals = again[:, : groups * size].view(batch, disparities, height, wide)
     return rivals[..., :width]
-
-
-def lookup_row(volume: Tensor, position: Tensor, reach: int) -> Tensor:
-    """Interpolate at each ``position`` [B, H, W, 1] and ``reach`` steps to either side of it.
-
-    Returns [B, H, W, 2 reach + 1]. Neighbours share their entries, which halves the gathers.
-    """
-    position = position.detach()
-    last = volume.shape[-1] - 1
-    low = torch.floor(position)
-    index = low + torch.arange(-reach, reach + 2, device=volume.device).to(volume.dtype)
-    inside = ((index >= 0) & (index <= last)).to(volume.dtype)
-    entries = volume.gather(3, index.clamp(0, last).long()) * inside
-    below, above = entries[..., :-1], entries[..., 1:]
-    return below + (above - below) * (position - low)
 
 
 def box3(x: Tensor) -> Tensor:

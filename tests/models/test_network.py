@@ -19,7 +19,7 @@ from vergence_models.config import Config, LiteNetworkConfig
 from vergence_models.evaluate import WEIGHTS
 from vergence_models.export import PARITY_PX, check_parity, export_run, shifted_pair
 from vergence_models.graphs import COLUMNS, Part, export_part
-from vergence_models.layers import all_pairs, banded, best_rival, lookup_row
+from vergence_models.layers import all_pairs, banded, best_rival
 from vergence_models.lite.network import LiteNetwork, LiteState
 from vergence_models.runs import Run
 from vergence_models.stepping import OnnxNetwork
@@ -170,12 +170,6 @@ def test_all_pairs_is_the_mean_product_of_descriptors() -> None:
     left, right = torch.randn(1, 6, 2, 4), torch.randn(1, 6, 2, 8)
     expected = torch.einsum("bchx,bchy->bhxy", left, right) / 6
     assert torch.allclose(all_pairs(left, right), expected, atol=1e-6)
-
-
-def test_lookups_interpolate_and_are_zero_outside() -> None:
-    volume = torch.arange(8.0).view(1, 1, 1, 8) ** 2
-    row = lookup_row(volume, torch.full((1, 1, 1, 1), 3.5), 1)
-    assert row.flatten().tolist() == pytest.approx([6.5, 12.5, 20.5])
 
 
 class Clamped(nn.Module):

@@ -1,4 +1,4 @@
-"""Laws of the volumes of `lite`: only near pairs, read between their entries."""
+"""Laws of volumes: only near pairs, read between their entries."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from vergence_models.layers import all_pairs, conv, joint
-from vergence_models.lite.volume import (
+from vergence_models.volume import (
     Near,
     Volume,
     gathered,

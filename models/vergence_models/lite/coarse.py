@@ -19,7 +19,7 @@ from vergence_models.layers import (
     squash,
 )
 from vergence_models.lite.hypotheses import Hypotheses
-from vergence_models.lite.volume import Volume, gathered, lookup, lookup_row
+from vergence_models.volume import Volume, gathered, lookup, lookup_row
 from vergence_models.warp import cell_centres
 
 BIN_PX = 4  # spacing of the coarse disparities

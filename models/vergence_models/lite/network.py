@@ -35,9 +35,9 @@ from vergence_models.lite.context import Context
 from vergence_models.lite.hypotheses import Hypotheses
 from vergence_models.lite.losses import search_cross_entropy
 from vergence_models.lite.refinement import Refined, Refinement, near_columns
-from vergence_models.lite.volume import whole_rows
 from vergence_models.losses import known, masked_mean, output_loss, robust
 from vergence_models.network import Estimate, State, StereoNetwork
+from vergence_models.volume import whole_rows
 from vergence_models.warp import warp_state
 from vergence_proto.model_io import StateTensor
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from vergence_models.graphs import (
     BATCH,
     COLUMNS,
     ROWS,
     Part,
+    PartOf,
     Sizes,
     cells,
     step_input_names,
@@ -25,12 +26,8 @@ NARROW = ("pairs", "context4", "context8", "context16")
 GIVEN = (*Clues._fields, *NARROW)
 
 
-class Wide(nn.Module):
+class Wide(PartOf[LiteNetwork]):
     """The wide search, and the state moved to the new view."""
-
-    def __init__(self, network: LiteNetwork) -> None:
-        super().__init__()
-        self.network = network
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         left, right, matrix, *state = inputs
@@ -38,23 +35,15 @@ class Wide(nn.Module):
         return *self.network.search_wide(left, right), *moved
 
 
-class Narrow(nn.Module):
+class Narrow(PartOf[LiteNetwork]):
     """The narrow search's volume, and the context. It takes about as long as the other."""
-
-    def __init__(self, network: LiteNetwork) -> None:
-        super().__init__()
-        self.network = network
 
     def forward(self, *images: Tensor) -> tuple[Tensor, ...]:
         left, right = images
         return self.network.search_narrow(left, right)
 
 
-class Iterate(nn.Module):
-    def __init__(self, network: LiteNetwork) -> None:
-        super().__init__()
-        self.network = network
-
+class Iterate(PartOf[LiteNetwork]):
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         fixed, features, *narrow = inputs[: len(GIVEN)]
         evidence = Evidence(Clues(fixed, features), *narrow)
@@ -63,11 +52,7 @@ class Iterate(nn.Module):
         return disparity, found.hidden, doubt, features
 
 
-class End(nn.Module):
-    def __init__(self, network: LiteNetwork) -> None:
-        super().__init__()
-        self.network = network
-
+class End(PartOf[LiteNetwork]):
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         disparity, hidden, doubt, features = inputs
         refined = Refined(disparity, doubt, features)
@@ -92,11 +77,11 @@ def parts_of(network: LiteNetwork) -> Parts[Part]:
         "at_hidden": cells(stride, 8),
     }
     wide, narrow = Wide(network), Narrow(network)
-    clues = tuple(tensor.detach() for tensor in wide(*inputs))
-    found = tuple(tensor.detach() for tensor in narrow(*inputs[:2]))
+    clues = wide.examples(*inputs)
+    found = narrow.examples(*inputs[:2])
     between = (*clues[:2], *found, *clues[2:])
     iterate = Iterate(network)
-    answer = tuple(tensor.detach() for tensor in iterate(*between))
+    answer = iterate.examples(*between)
     return Parts(
         begin=(
             Part(wide, inputs, sizes, step_input_names(network), (*Clues._fields, *moving)),

@@ -21,7 +21,7 @@ from vergence_models.layers import (
 )
 from vergence_models.lite.coarse import MIN_PX, beyond
 from vergence_models.lite.hypotheses import Hypotheses
-from vergence_models.lite.volume import Near, Volume, lookup, lookup_row
+from vergence_models.volume import Near, Volume, lookup, lookup_row
 from vergence_models.warp import cell_centres
 
 SURFACES = 3  # hypotheses of a cell

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from vergence_models.graphs import (
     BATCH,
     COLUMNS,
     ROWS,
     Part,
+    PartOf,
     Sizes,
     cells,
     step_input_names,
@@ -20,33 +21,21 @@ from vergence_models.raft.update import CELL_PX, pyramid
 from vergence_models.stitch import TAKES_PLACE, Parts
 
 
-class Begin(nn.Module):
-    def __init__(self, network: RaftNetwork) -> None:
-        super().__init__()
-        self.network = network
-
+class Begin(PartOf[RaftNetwork]):
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         left, right, matrix, *state = inputs
         _, given, moving = self.network.begin(left, right, matrix, RaftState(*state))
         return *given, *moving
 
 
-class Iterate(nn.Module):
-    def __init__(self, network: RaftNetwork) -> None:
-        super().__init__()
-        self.network = network
-
+class Iterate(PartOf[RaftNetwork]):
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         given, moving = RaftGiven(*inputs[:3]), RaftState(*inputs[3:])
         # Every iteration makes the pyramid anew; onnxruntime drops the repetitions.
         return self.network.iterate(given, pyramid(given.pairs), moving)
 
 
-class End(nn.Module):
-    def __init__(self, network: RaftNetwork) -> None:
-        super().__init__()
-        self.network = network
-
+class End(PartOf[RaftNetwork]):
     def forward(self, *moving: Tensor) -> tuple[Tensor, ...]:
         disparity, sigma, following = self.network.end(RaftState(*moving))
         return disparity, sigma, *following
@@ -62,7 +51,7 @@ def parts_of(network: RaftNetwork) -> Parts[Part]:
     given_sizes, moving_sizes = (pairs, eighth, sixteenth), (eighth, eighth, sixteenth)
     inputs, sizes = step_inputs(network)
     begin = Begin(network)
-    between = tuple(tensor.detach() for tensor in begin(*inputs))
+    between = begin.examples(*inputs)
     return Parts(
         (Part(begin, inputs, sizes, step_input_names(network), given + moving),),
         Part(Iterate(network), between, given_sizes + moving_sizes, given + moving, moved),

@@ -12,7 +12,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from vergence_models.config import RaftNetworkConfig
-from vergence_models.layers import all_pairs, lookup_row, silent
+from vergence_models.layers import all_pairs, silent
+from vergence_models.volume import lookup_row, whole_rows
 
 CELL_PX = 8  # of the matched features
 LEVELS = 4
@@ -34,12 +35,12 @@ def pyramid(pairs: Tensor) -> list[Tensor]:
 
 def looked_up(levels: list[Tensor], d: Tensor) -> Tensor:
     """Correlations round disparity ``d`` [B, 1, H, W] px: [B, LEVELS (2 REACH + 1), H, W]."""
-    column = right_column(d).permute(0, 2, 3, 1)
+    column = right_column(d)
     found = [
-        lookup_row(pairs, (column + 0.5) / 2**level - 0.5, REACH)
+        lookup_row(whole_rows(pairs), (column + 0.5) / 2**level - 0.5, REACH)
         for level, pairs in enumerate(levels)
     ]
-    return torch.cat(found, dim=-1).permute(0, 3, 1, 2)
+    return torch.cat(found, dim=1)
 
 
 def right_column(d: Tensor) -> Tensor:
