@@ -22,7 +22,8 @@ from vergence_models.calibrate import (
     make_int8,
 )
 from vergence_models.data.pool import ClipPool, write_shard
-from vergence_models.quantize import Scale, plan, quantized, with_weights_apart
+from vergence_models.quantization_plan import plan
+from vergence_models.quantize import Scale, quantized, with_weights_apart
 from vergence_proto.model_io import StateTensor
 
 STATES = (StateTensor("disparity", 1, 4),)
