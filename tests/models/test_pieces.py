@@ -30,11 +30,6 @@ TINY = Config("full", NETWORK, TrainingConfig(frames=2, warmup_steps=1))
 CPU = torch.device("cpu")
 
 
-@pytest.fixture(autouse=True)
-def one_thread() -> None:
-    torch.set_num_threads(1)
-
-
 @pytest.fixture
 def clips() -> StereoClips:
     return wall_clips(1, frames=2)

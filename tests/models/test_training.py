@@ -36,11 +36,6 @@ SMALL = Config(
 )
 
 
-@pytest.fixture(autouse=True)
-def one_thread() -> None:
-    torch.set_num_threads(1)
-
-
 @pytest.fixture
 def pool(tmp_path: Path) -> Path:
     write_shard(tmp_path / "pool" / "shard_1_000000", wall_clips(3))

@@ -1,61 +1,14 @@
 """Whatever is wrong on disk, the error names the file and says what was expected."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.proto import trees
-from vergence_proto.layouts import LayoutError, find_sources, open_source
-
-
-def opening(spec: str) -> str:
-    """What reading all of a source says is wrong."""
-    with pytest.raises(LayoutError) as caught:
-        list(open_source(spec))
-    return str(caught.value)
-
-
-def cut(path: Path) -> None:
-    """Drop the second half of a file."""
-    data = path.read_bytes()
-    path.write_bytes(data[: len(data) // 2])
-
-
-class TestSpecs:
-    @pytest.mark.parametrize("spec", ["", "room", "kitty:/tmp", ":/tmp"])
-    def test_an_unknown_kind_names_the_known_ones(self, spec: str) -> None:
-        assert "vergence:PATH, kitti:PATH, kitti2012:PATH" in opening(spec)
-
-    def test_a_folder_that_is_not_there(self, tmp_path: Path) -> None:
-        assert opening(f"vergence:{tmp_path}/a/b") == f"{tmp_path}/a/b: no such folder"
-
-    def test_a_tree_of_sources_names_them(self, tmp_path: Path) -> None:
-        for name in ("a", "b"):
-            trees.vergence_sequence(tmp_path / name)
-        message = opening(f"vergence:{tmp_path}")
-        assert message.startswith(f"{tmp_path}/calib.json: not found")
-        assert f"take one: vergence:{tmp_path}/a/room, vergence:{tmp_path}/b/room" in message
-
-    def test_a_large_tree_names_some_and_counts_the_rest(self, tmp_path: Path) -> None:
-        for k in range(14):
-            trees.write_lines(tmp_path / str(k) / "calib.json", "{}")
-            trees.write_image(tmp_path / str(k) / "left.png", trees.an_image(k))
-        assert opening(f"vergence:{tmp_path}").endswith("and 2 more")
-
-    def test_nothing_is_found_where_nothing_is(self, tmp_path: Path) -> None:
-        assert find_sources(f"kitti:{tmp_path}") == []
-
-    def test_an_option_of_another_layout(self, tmp_path: Path) -> None:
-        assert "unknown option 'fx'; kitti: takes none" in opening(f"kitti:{tmp_path}?fx=3")
-
-    def test_an_option_that_is_no_number(self, tmp_path: Path) -> None:
-        assert "fx: could not convert" in opening(f"sceneflow:{tmp_path}?fx=wide")
-
-
-Change = Callable[[Path], object]
+from tests.proto.sources import Change, cut, opening
+from vergence_proto.layouts import open_source
 
 
 def _calib(**values: object) -> Change:
@@ -196,24 +149,6 @@ TARTANAIR = [
         "depth.npy: expected depth [H, W], got [3]",
     ),
 ]
-SCENEFLOW = [
-    ("half a PFM", "disparity/TRAIN/A/0000/left/0007.pfm", cut, "0007.pfm: 24x16 needs 1536 bytes"),
-    ("no PFM", "disparity/TRAIN/A/0000/left/0007.pfm", Path.unlink, "0007.pfm: not found"),
-    ("no cameras", "camera_data/TRAIN/A/0000/camera_data.txt", Path.unlink, "not found"),
-    (
-        "empty cameras",
-        "camera_data/TRAIN/A/0000/camera_data.txt",
-        lambda path: path.write_text("\n"),
-        "camera_data.txt: expected blocks of 'Frame N', found none",
-    ),
-    (
-        "half the cameras",
-        "camera_data/TRAIN/A/0000/camera_data.txt",
-        lambda path: path.write_text("Frame 1\nL 1 0 0\n"),
-        "camera_data.txt: expected 'Frame N', 'L ...', 'R ...'",
-    ),
-    ("no right image", "frames_finalpass/TRAIN/A/0000/right/0008.png", Path.unlink, "not found"),
-]
 MIDDLEBURY = [
     ("no calibration", _without("calib.txt"), "calib.txt: not found"),
     ("no baseline", _replaced("calib.txt", "baseline", "base"), "expected a line baseline=..."),
@@ -246,49 +181,6 @@ def test_the_file_is_named(kind: str, change: Change, message: str, tmp_path: Pa
     said = opening(f"{kind}:{folder}")
     assert message in said
     assert str(tmp_path) in said or folder.name in said
-
-
-@pytest.mark.parametrize(
-    ("file", "change", "message"),
-    [pytest.param(*case[1:], id=case[0]) for case in SCENEFLOW],
-)
-def test_sceneflow_names_the_file(file: str, change: Change, message: str, tmp_path: Path) -> None:
-    folder = trees.sceneflow_sequence(tmp_path)
-    change(tmp_path / file)
-    said = opening(f"sceneflow:{folder}?fx=20")
-    assert message in said
-    assert str(tmp_path / file) in said
-
-
-def test_sceneflow_asks_for_a_focal_length_it_cannot_know(tmp_path: Path) -> None:
-    folder = trees.sceneflow_sequence(tmp_path)
-    said = opening(f"sceneflow:{folder}")
-    assert "24x16 are not SceneFlow's own, and the layout states no focal length" in said
-    assert f"add it: sceneflow:{folder}?fx=PIXELS" in said
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("{", "not JSON"),
-        ("[]", "expected a JSON object, got list"),
-        ('{"fx": "wide"}', "expected a number for 'fx'"),
-        ('{"fx": 20, "fps": 0}', "expected a positive fps"),
-    ],
-)
-def test_sceneflow_names_intrinsics_it_cannot_use(text: str, message: str, tmp_path: Path) -> None:
-    folder = trees.sceneflow_sequence(tmp_path)
-    beside = tmp_path / "camera_data" / "TRAIN" / "A" / "0000" / "intrinsics.json"
-    beside.write_text(text)
-    said = opening(f"sceneflow:{folder}")
-    assert message in said
-    assert str(beside) in said
-
-
-def test_sceneflow_is_known_by_its_passes(tmp_path: Path) -> None:
-    assert "expected a sequence under frames_cleanpass or frames_finalpass" in opening(
-        f"sceneflow:{tmp_path}?fx=20"
-    )
 
 
 @pytest.mark.parametrize("year", [2012, 2015])

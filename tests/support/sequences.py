@@ -2,6 +2,7 @@
 
 import io
 import json
+import struct
 import tarfile
 import zipfile
 from collections.abc import Iterable, Iterator
@@ -79,3 +80,8 @@ def write_sequence(folder: Path, frames: Iterable[StereoFrame]) -> Path:
     for name, content in sequence_files(frames):
         (folder / name).write_bytes(content)
     return folder
+
+
+def with_size(file: bytes, width: int, height: int) -> bytes:
+    """A PNG whose header states another size."""
+    return file[:16] + struct.pack(">II", width, height) + file[24:]
