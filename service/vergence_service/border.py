@@ -49,7 +49,7 @@ class Answer:
     timings: Timings
 
     def disparity_map(self) -> DisparityMap:
-        """Works on whole images, so it runs in a worker thread."""
+        """Works on whole images: to be called in a worker thread."""
         result, opening = self.timed.result, self.stream.opening
         pose = self.view.world_from_left
         return DisparityMap(

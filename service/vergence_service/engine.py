@@ -136,18 +136,18 @@ class DepthEngine:
         *,
         arrived_s: float,
         max_age_s: float | None = None,
-    ) -> DisparityMap:
+    ) -> Answer:
         """Advance one stream by one frame; a step that failed has left the stream as it was.
 
         ``decode`` runs in a worker thread when the frame's turn has come, so a frame that is
-        displaced before is never decoded. Raises what it raises, UnknownStream, StreamExpired,
+        displaced before is never decoded. Of the answer the caller makes the map, together with
+        what is sent of it. Raises what ``decode`` raises, UnknownStream, StreamExpired,
         BadShape, FrameOutOfOrder, FrameStale, ModelFailed; and NonFinite, after which the
         stream starts anew.
         """
         stream = self.streams.get(stream_id)
         self.streams.touch(stream)
-        answer = await self._step(stream, decode, arrived_s=arrived_s, max_age_s=max_age_s)
-        return await asyncio.to_thread(answer.disparity_map)
+        return await self._step(stream, decode, arrived_s=arrived_s, max_age_s=max_age_s)
 
     async def open_apart(self, opening: Opening, *, state: RecurrentState | None = None) -> Stream:
         """A stream that nobody attaches to, for a sequence that is known from its first frame on.
@@ -165,7 +165,7 @@ class DepthEngine:
     async def step_apart(
         self, stream: Stream, decode: Callable[[], StereoFrame]
     ) -> tuple[DisparityMap, RecurrentState]:
-        """As :meth:`step`, of a stream that :meth:`open_apart` made; and the state that it left."""
+        """As :meth:`step`, of a stream that :meth:`open_apart` made: the map, the state left."""
         answer = await self._step(stream, decode, arrived_s=self._clock(), max_age_s=None)
         return await asyncio.to_thread(answer.disparity_map), answer.timed.result.state
 

@@ -34,7 +34,8 @@ OPENING = Opening(StereoRig.from_rectified(RIG))
 
 
 async def step(engine: DepthEngine, stream_id: str, frame: StereoFrame) -> DisparityMap:
-    return await engine.step(stream_id, lambda: frame, arrived_s=0.0)
+    answer = await engine.step(stream_id, lambda: frame, arrived_s=0.0)
+    return answer.disparity_map()
 
 
 def turned(degrees: float, position_m: tuple[float, float, float] = (0, 0, 0)) -> Pose:

@@ -107,7 +107,7 @@ async def test_replies_state_the_rectified_rig_its_pose_and_nothing_unseen() -> 
     frame = StereoFrame(1, 1, image, image, PoseSample(world_from_left))
     async with running_server(RecallModel()) as server:
         await server.engine.open("a", Opening(rig))
-        answer = await server.engine.step("a", lambda: frame, arrived_s=0.0)
+        answer = (await server.engine.step("a", lambda: frame, arrived_s=0.0)).disparity_map()
     assert answer.rig == rectifier.rig
     assert answer.world_from_left is not None
     expected = world_from_left @ rectifier.left_from_rectified

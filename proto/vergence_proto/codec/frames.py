@@ -107,23 +107,26 @@ def frame_from_proto(
     )
 
 
-def disparity_to_proto(disparity: DisparityMap, output: OutputFormat) -> pb.DisparityMap:
-    """Encode a map; its pose goes as it is, so the caller has put it into the stream's axes."""
-    message = pb.DisparityMap(
-        frame_id=disparity.frame_id,
-        capture_ns=disparity.capture_ns,
-        disparity=plane_to_proto(disparity.disparity_px, output),
-        origin=origin_to_proto(disparity.origin),
-        step_count=disparity.step_count,
-        iterations=disparity.iterations,
-        frames_skipped=disparity.frames_skipped,
-        timings=timings_to_proto(disparity.timings),
-    )
+def disparity_to_proto(
+    disparity: DisparityMap, output: OutputFormat, *, into: pb.DisparityMap | None = None
+) -> pb.DisparityMap:
+    """Encode a map, ``into`` the field of a larger message if it is to be one, to save a copy.
+
+    Its pose goes as it is, so the caller has put it into the stream's axes.
+    """
+    message = pb.DisparityMap() if into is None else into
+    message.frame_id, message.capture_ns = disparity.frame_id, disparity.capture_ns
+    plane_to_proto(disparity.disparity_px, output, into=message.disparity)
+    message.origin = origin_to_proto(disparity.origin)
+    message.step_count, message.iterations = disparity.step_count, disparity.iterations
+    message.frames_skipped = disparity.frames_skipped
+    message.timings.CopyFrom(timings_to_proto(disparity.timings))
     if output.confidence and disparity.confidence is not None:
-        confidence = bytes_plane_to_proto(disparity.confidence, compressed=output.compressed)
-        message.confidence.CopyFrom(confidence)
+        bytes_plane_to_proto(
+            disparity.confidence, compressed=output.compressed, into=message.confidence
+        )
     if output.sigma and disparity.sigma_px is not None:
-        message.sigma.CopyFrom(plane_to_proto(disparity.sigma_px, output))
+        plane_to_proto(disparity.sigma_px, output, into=message.sigma)
     if disparity.world_from_left is not None:
         message.world_from_left.CopyFrom(pose_to_proto(disparity.world_from_left))
     return message

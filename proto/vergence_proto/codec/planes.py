@@ -38,35 +38,33 @@ _WIRE_TYPES: dict[int, np.dtype[Any]] = {
 }
 
 
-def plane_to_proto(plane: Plane, output: OutputFormat) -> pb.Plane:
+def plane_to_proto(plane: Plane, output: OutputFormat, *, into: pb.Plane | None = None) -> pb.Plane:
     """Encode float32 [H, W], NaN where there is no value, as ``output`` says.
 
     UINT16 has no zero and no negative number: what is below half a step becomes "no value". Above
-    65535 / denominator it saturates.
+    65535 / denominator it saturates. ``into`` is a field of a larger message, to save a copy.
     """
-    height, width = plane.shape
     match output.encoding:
         case PlaneEncoding.UINT16:
-            stored = _fixed_point(plane, output.denominator)
-            message = _integers_to_proto(stored, compressed=output.compressed)
-            message.denominator = output.denominator
-            return message
+            kind = pb.PLANE_ENCODING_UINT16
+            stored: Stored = _fixed_point(plane, output.denominator)
         case PlaneEncoding.FLOAT16:
             kind = pb.PLANE_ENCODING_FLOAT16
+            stored = plane.astype(_WIRE_TYPES[kind])
         case PlaneEncoding.FLOAT32:
             kind = pb.PLANE_ENCODING_FLOAT32
-    return pb.Plane(
-        encoding=kind,
-        compression=pb.COMPRESSION_NONE,
-        width=width,
-        height=height,
-        data=plane.astype(_WIRE_TYPES[kind], copy=False).tobytes(),
-    )
+            stored = plane.astype(_WIRE_TYPES[kind], copy=False)
+    message = _stored_to_proto(stored, kind, compressed=output.compressed, into=into)
+    if kind == pb.PLANE_ENCODING_UINT16:
+        message.denominator = output.denominator
+    return message
 
 
-def bytes_plane_to_proto(plane: NDArray[np.uint8], *, compressed: bool) -> pb.Plane:
-    """Encode uint8 [H, W]."""
-    return _integers_to_proto(plane, compressed=compressed)
+def bytes_plane_to_proto(
+    plane: NDArray[np.uint8], *, compressed: bool, into: pb.Plane | None = None
+) -> pb.Plane:
+    """Encode uint8 [H, W]; ``into`` is a field of a larger message, to save a copy."""
+    return _stored_to_proto(plane, pb.PLANE_ENCODING_UINT8, compressed=compressed, into=into)
 
 
 def plane_from_proto(message: pb.Plane) -> Plane:
@@ -108,16 +106,16 @@ def _fixed_point(plane: Plane, denominator: int) -> NDArray[np.uint16]:
     return scaled.astype("<u2")
 
 
-def _integers_to_proto(stored: Stored, *, compressed: bool) -> pb.Plane:
-    height, width = stored.shape
-    wide = stored.dtype.itemsize == 2
-    return pb.Plane(
-        encoding=pb.PLANE_ENCODING_UINT16 if wide else pb.PLANE_ENCODING_UINT8,
-        compression=pb.COMPRESSION_DELTA_ZSTD if compressed else pb.COMPRESSION_NONE,
-        width=width,
-        height=height,
-        data=compress_plane(stored) if compressed else stored.tobytes(),
-    )
+def _stored_to_proto(
+    stored: Stored, kind: pb.PlaneEncoding, *, compressed: bool, into: pb.Plane | None
+) -> pb.Plane:
+    compressed = compressed and stored.dtype.kind == "u"  # of no use to floating point
+    message = pb.Plane() if into is None else into
+    message.encoding = kind
+    message.compression = pb.COMPRESSION_DELTA_ZSTD if compressed else pb.COMPRESSION_NONE
+    message.height, message.width = stored.shape
+    message.data = compress_plane(stored) if compressed else stored.tobytes()
+    return message
 
 
 def _stored(message: pb.Plane) -> Stored:

@@ -186,7 +186,7 @@ class DepthCall:
             try:
                 if letter.reset_before:
                     await self._engine.reset(stream.stream_id)
-                disparity = await self._engine.step(
+                answer = await self._engine.step(
                     stream.stream_id,
                     partial(
                         codec.frame_from_proto,
@@ -201,9 +201,7 @@ class DepthCall:
                 self._outbox.release_map()
                 await self._refuse(letter.frame_id, error)
             else:
-                await self._outbox.put_map(
-                    disparity, stream.opening.output, arrived_s=letter.arrived_s
-                )
+                await self._outbox.put_map(answer, arrived_s=letter.arrived_s)
 
     async def _refuse(self, frame_id: int, error: DepthError) -> None:
         message = codec.error_to_frame_error(frame_id, error)

@@ -5,8 +5,8 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
 from vergence_proto import codec
-from vergence_proto.types import DisparityMap, OutputFormat
 from vergence_proto.v1 import depth_pb2 as pb
+from vergence_service.border import Answer
 from vergence_service.metrics import Metrics
 from vergence_service.streams import Notice, NoticeKind
 
@@ -24,8 +24,7 @@ _NOTICE = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Map:
-    disparity: DisparityMap
-    output: OutputFormat
+    answer: Answer
     arrived_s: float
 
 
@@ -72,11 +71,9 @@ class Outbox:
         """No map came of the frame."""
         self._unsent.release()
 
-    async def put_map(
-        self, disparity: DisparityMap, output: OutputFormat, *, arrived_s: float
-    ) -> None:
+    async def put_map(self, answer: Answer, *, arrived_s: float) -> None:
         """Into the room that was reserved; ``arrived_s`` is its frame's."""
-        await self._answers.put(_Map(disparity, output, arrived_s))
+        await self._answers.put(_Map(answer, arrived_s))
 
     async def finish(self) -> None:
         """Nothing follows."""
@@ -96,13 +93,16 @@ class Outbox:
                 case _:
                     await self._write(answer)
 
-    def _encoded(self, answer: _Map) -> pb.StreamDepthResponse:
+    def _encoded(self, waiting: _Map) -> pb.StreamDepthResponse:
         started_s = self._clock()
-        message = codec.disparity_to_proto(answer.disparity, answer.output)
+        answer, response = waiting.answer, pb.StreamDepthResponse()
+        message = codec.disparity_to_proto(
+            answer.disparity_map(), answer.stream.opening.output, into=response.disparity
+        )
         encode_s = self._clock() - started_s
-        total_s = self._clock() - answer.arrived_s
+        total_s = self._clock() - waiting.arrived_s
         message.timings.encode_us = round(encode_s * 1e6)
         message.timings.total_us = round(total_s * 1e6)
         self._metrics.stage_s.labels("encode").observe(encode_s)
         self._metrics.stage_s.labels("total").observe(total_s)
-        return pb.StreamDepthResponse(disparity=message)
+        return response
