@@ -5,6 +5,7 @@ import time
 from collections import deque
 
 from vergence.flights import Flights
+from vergence.link import RESET
 from vergence.results import DepthResult
 from vergence.transports.base import ConnectionLost
 from vergence_proto import codec
@@ -38,17 +39,18 @@ class Answers:
             raise item
         return item
 
-    def attached(self, opened: pb.StreamOpened) -> list[pb.StreamDepthRequest]:
+    def attached(self, opened: pb.StreamOpened) -> list[bytes]:
         self.opened = opened
         self.rig = codec.rectified_rig_from_proto(opened.rig)
         self.flights.credit = max(opened.credit, 1)
         taken = ConnectionLost("the connection broke after the server took the frame")
         flights = self.flights.in_order()
         self.flights.abandon((f for f in flights if f.frame_id <= opened.last_frame_id), taken)
-        requests = [flight.request for flight in self.flights.in_order()]
+        flights = self.flights.in_order()
+        requests = [flight.request for flight in flights]
         if self.reset_after is not None:
-            before = sum(request.frame.frame_id <= self.reset_after for request in requests)
-            requests.insert(before, pb.StreamDepthRequest(reset=pb.Reset()))
+            before = sum(flight.frame_id <= self.reset_after for flight in flights)
+            requests.insert(before, RESET)
         return requests
 
     def detached(self, lost: ConnectionLost) -> None:

@@ -5,19 +5,15 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from vergence.results import DepthResult, Drops
-from vergence_proto.v1 import depth_pb2 as pb
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Flight:
     """A frame that was sent and not answered yet."""
 
-    request: pb.StreamDepthRequest
+    frame_id: int
+    request: bytes  # as it was sent
     answer: asyncio.Future[DepthResult] | None  # None: live, nobody waits for this very frame
-
-    @property
-    def frame_id(self) -> int:
-        return self.request.frame.frame_id
 
     def fail(self, error: Exception) -> None:
         if self.answer is not None and not self.answer.done():

@@ -11,6 +11,9 @@ from vergence.transports.base import Call, ConnectionLost, Transport
 from vergence_proto.errors import NotReady
 from vergence_proto.v1 import depth_pb2 as pb
 
+RESET = pb.StreamDepthRequest(reset=pb.Reset()).SerializeToString()
+_END = pb.StreamDepthRequest(end=pb.End()).SerializeToString()
+
 _OPEN_TIMEOUT_S = 5.0
 _CLOSE_TIMEOUT_S = 2.0
 _PING_INTERVAL_S = 1.0
@@ -25,7 +28,7 @@ _NOTICES = {
 class LinkUser(Protocol):
     """What the link tells its session; none of it may block."""
 
-    def attached(self, opened: pb.StreamOpened) -> list[pb.StreamDepthRequest]:
+    def attached(self, opened: pb.StreamOpened) -> list[bytes]:
         """The stream is open, or open again; returns what must be sent again."""
 
     def detached(self, lost: ConnectionLost) -> None: ...
@@ -50,7 +53,7 @@ class Link:
         self._opening = opening
         self._user = user
         self._on_event = on_event
-        self._outbox: asyncio.Queue[pb.StreamDepthRequest] = asyncio.Queue()
+        self._outbox: asyncio.Queue[bytes] = asyncio.Queue()
         self._ending = False
         self.up = False  # a frame handed over now goes out at once
         self.round_trip_s: float | None = None
@@ -74,13 +77,14 @@ class Link:
             self._runner.cancel()
             await asyncio.gather(self._runner, return_exceptions=True)
 
-    def send(self, request: pb.StreamDepthRequest) -> None:
+    def send(self, request: bytes) -> None:
+        """Queue a ``pb.StreamDepthRequest``, serialized."""
         self._outbox.put_nowait(request)
 
     def end(self) -> None:
         if not self._ending:
             self._ending = True
-            self.send(pb.StreamDepthRequest(end=pb.End()))
+            self.send(_END)
 
     async def _run(self, call: Call) -> None:
         error: Exception | None = ConnectionLost("the session was closed")
@@ -116,14 +120,15 @@ class Link:
 
     async def _ping(self) -> None:
         while True:
-            self.send(pb.StreamDepthRequest(ping=pb.Ping(client_ns=time.monotonic_ns())))
+            ping = pb.Ping(client_ns=time.monotonic_ns())
+            self.send(pb.StreamDepthRequest(ping=ping).SerializeToString())
             await asyncio.sleep(_PING_INTERVAL_S)
 
     async def _attach(self) -> Call:
         call = await self._transport.open_call(self._opening.stream_id)
         try:
             async with asyncio.timeout(_OPEN_TIMEOUT_S):
-                await call.send(pb.StreamDepthRequest(open=self._opening))
+                await call.send(pb.StreamDepthRequest(open=self._opening).SerializeToString())
                 response = await call.receive()
             if response is None or not response.HasField("opened"):
                 raise NotReady(f"expected the server to open the stream, got {response}")
@@ -142,7 +147,7 @@ class Link:
         for request in again:
             self.send(request)
         if self._ending:
-            self.send(pb.StreamDepthRequest(end=pb.End()))
+            self.send(_END)
         self.up = True
         return call
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from vergence.answers import Answers
 from vergence.flights import Flight
 from vergence.info import ModelInfo
-from vergence.link import Link
+from vergence.link import RESET, Link
 from vergence.results import DepthResult, Drops, SessionEvent
 from vergence.transports.base import Transport
 from vergence_proto import codec
@@ -126,8 +126,7 @@ class DepthSession:
             self._answers.flights.count(at_source=1)
             return None
         request = self._request(left, right, world_from_left, capture_ns, max_age_s)
-        self._launch(Flight(request, answer=None))
-        return request.frame.frame_id
+        return self._launch(request, answer=None)
 
     async def step(
         self,
@@ -148,14 +147,14 @@ class DepthSession:
             await self._answers.flights.room()
             self._check_open()
             request = self._request(left, right, world_from_left, capture_ns, max_age_s=None)
-            self._launch(Flight(request, answer))
+            self._launch(request, answer)
         return await answer
 
     def reset(self) -> None:
         """Frames after this start from nothing, as after a cut in a film."""
         self._check_open()
         self._answers.reset_after = self._next_id - 1
-        self._link.send(pb.StreamDepthRequest(reset=pb.Reset()))
+        self._link.send(RESET)
 
     def end(self) -> None:
         """No frame follows: iteration stops after the last answer, and the server frees the state.
@@ -188,24 +187,19 @@ class DepthSession:
         world_from_left: WorldFromLeft,
         capture_ns: int | None,
         max_age_s: float | None,
-    ) -> pb.StreamDepthRequest:
+    ) -> bytes:
         if isinstance(world_from_left, np.ndarray):
             world_from_left = Pose.from_matrix(world_from_left)
         if isinstance(world_from_left, Pose):
             world_from_left = PoseSample(world_from_left)
         capture_ns = time.monotonic_ns() if capture_ns is None else capture_ns
         frame = StereoFrame(self._next_id, capture_ns, left, right, world_from_left)
-        request = pb.StreamDepthRequest()
-        codec.frame_to_proto(
-            frame,
-            encoding=self._encoding,
-            jpeg_quality=self._jpeg_quality,
-            max_age_s=max_age_s,
-            into=request.frame,
+        return codec.frame_to_request(
+            frame, encoding=self._encoding, jpeg_quality=self._jpeg_quality, max_age_s=max_age_s
         )
-        return request
 
-    def _launch(self, flight: Flight) -> None:
-        self._next_id += 1
-        self._answers.flights.launch(flight)
-        self._link.send(flight.request)
+    def _launch(self, request: bytes, answer: asyncio.Future[DepthResult] | None) -> int:
+        frame_id, self._next_id = self._next_id, self._next_id + 1
+        self._answers.flights.launch(Flight(frame_id, request, answer))
+        self._link.send(request)
+        return frame_id

@@ -132,9 +132,9 @@ async def measure(args: argparse.Namespace) -> dict[str, float]:
     scene = make_scene(args.warm_up + args.rounds)
     left, right, pose = scene[0]
     encoding = ImageEncoding(args.encoding)
-    request = codec.frame_to_proto(
+    request = codec.frame_to_request(
         StereoFrame(1, 1, left, right, PoseSample(pose)), encoding=encoding
-    ).SerializeToString()
+    )
     model = BareModel(args.threads)
     async with (
         serving(args.threads) as address,

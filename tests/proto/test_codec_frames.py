@@ -27,8 +27,17 @@ def a_frame(pose: Pose | None = None) -> StereoFrame:
     return StereoFrame(7, -5, left, left[::-1].copy(), sample)
 
 
+def sent(
+    frame: StereoFrame,
+    encoding: ImageEncoding = ImageEncoding.RAW,
+    max_age_s: float | None = None,
+) -> pb.Frame:
+    request = codec.frame_to_request(frame, encoding=encoding, max_age_s=max_age_s)
+    return pb.StreamDepthRequest.FromString(request).frame
+
+
 def a_frame_message() -> pb.Frame:
-    return codec.frame_to_proto(a_frame(Pose.identity()), encoding=ImageEncoding.RAW)
+    return sent(a_frame(Pose.identity()))
 
 
 def a_map(pose: Pose | None = None) -> DisparityMap:
@@ -53,17 +62,17 @@ def a_map(pose: Pose | None = None) -> DisparityMap:
 class TestFrames:
     @given(POSES)
     def test_a_frame_arrives_as_it_was_sent(self, pose: Pose) -> None:
-        sent = a_frame(pose)
-        message = codec.frame_to_proto(sent, encoding=ImageEncoding.RAW, max_age_s=0.25)
-        back = codec.frame_from_proto(pb.Frame.FromString(message.SerializeToString()))
+        frame = a_frame(pose)
+        message = sent(frame, max_age_s=0.25)
+        back = codec.frame_from_proto(message)
         assert (back.frame_id, back.capture_ns, message.max_age_s) == (7, -5, 0.25)
-        np.testing.assert_array_equal(back.left, sent.left)
-        np.testing.assert_array_equal(back.right, sent.right)
+        np.testing.assert_array_equal(back.left, frame.left)
+        np.testing.assert_array_equal(back.right, frame.right)
         assert back.pose is not None
         assert_same_pose(back.pose.world_from_left, pose)
 
     def test_a_frame_without_a_pose_stays_without(self) -> None:
-        message = codec.frame_to_proto(a_frame(), encoding=ImageEncoding.PNG)
+        message = sent(a_frame(), ImageEncoding.PNG)
         assert codec.frame_from_proto(message).pose is None
         assert not message.HasField("max_age_s")
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from numpy.typing import NDArray
 
-from vergence_proto.codec import image_from_proto, image_to_proto
+from vergence_proto.codec import image_from_proto, image_to_wire
 from vergence_proto.codec.images import decode_image
 from vergence_proto.errors import BadImage
 from vergence_proto.types import Image, ImageEncoding
@@ -28,10 +28,12 @@ def smooth_image(height: int = 48, width: int = 64) -> Image:
     return np.stack([2 * u + v, 255 - 3 * v, u + v], axis=-1).astype(np.uint8)
 
 
+def sent(image: NDArray[np.uint8], encoding: ImageEncoding, **options: int) -> pb.Image:
+    return pb.Image.FromString(b"".join(image_to_wire(image, encoding, **options)))
+
+
 def over_the_wire(image: NDArray[np.uint8], encoding: ImageEncoding) -> Image:
-    return image_from_proto(
-        pb.Image.FromString(image_to_proto(image, encoding).SerializeToString())
-    )
+    return image_from_proto(sent(image, encoding))
 
 
 @pytest.mark.parametrize("encoding", LOSSLESS)
@@ -48,7 +50,7 @@ def test_grey_comes_back_as_rgb(encoding: ImageEncoding, grey: NDArray[np.uint8]
 
 
 def test_raw_grey_travels_at_a_third_of_the_size() -> None:
-    message = image_to_proto(smooth_image()[..., 0], ImageEncoding.RAW)
+    message = sent(smooth_image()[..., 0], ImageEncoding.RAW)
     assert message.encoding == pb.IMAGE_ENCODING_MONO8
     assert len(message.data) == 48 * 64
 
@@ -66,8 +68,7 @@ def test_jpeg_is_close_and_red_stays_red() -> None:
 def test_lower_jpeg_quality_is_smaller() -> None:
     noise = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
     sizes = [
-        len(image_to_proto(noise, ImageEncoding.JPEG, jpeg_quality=quality).data)
-        for quality in (30, 90)
+        len(sent(noise, ImageEncoding.JPEG, jpeg_quality=quality).data) for quality in (30, 90)
     ]
     assert sizes[0] < sizes[1]
 
@@ -83,7 +84,7 @@ def test_lower_jpeg_quality_is_smaller() -> None:
 )
 def test_what_is_no_image_is_refused_before_it_is_sent(image: NDArray[np.uint8]) -> None:
     with pytest.raises(BadImage, match="expected"):
-        image_to_proto(image, ImageEncoding.RAW)
+        sent(image, ImageEncoding.RAW)
 
 
 class TestDamage:
@@ -92,7 +93,7 @@ class TestDamage:
     def test_a_file_cut_anywhere_is_an_error_and_not_a_grey_half(
         self, encoding: ImageEncoding, data: st.DataObject
     ) -> None:
-        message = image_to_proto(smooth_image(), encoding)
+        message = sent(smooth_image(), encoding)
         message.data = message.data[: data.draw(st.integers(0, len(message.data) - 1))]
         with pytest.raises(BadImage, match=r"cut short|expected a"):
             image_from_proto(message)
@@ -102,7 +103,7 @@ class TestDamage:
     def test_a_changed_byte_gives_an_image_of_that_size_or_the_error(
         self, encoding: ImageEncoding, position: float, value: int
     ) -> None:
-        message = image_to_proto(smooth_image(), encoding)
+        message = sent(smooth_image(), encoding)
         changed = bytearray(message.data)
         changed[round(position * (len(changed) - 1))] = value
         message.data = bytes(changed)
@@ -124,13 +125,13 @@ class TestDamage:
 
     @pytest.mark.parametrize("encoding", FILES)
     def test_padding_after_the_end_is_no_damage(self, encoding: ImageEncoding) -> None:
-        message = image_to_proto(smooth_image(), encoding)
+        message = sent(smooth_image(), encoding)
         message.data += bytes(16)
         assert image_from_proto(message).shape == (48, 64, 3)
 
     @pytest.mark.parametrize("encoding", FILES)
     def test_one_encoding_is_not_read_as_the_other(self, encoding: ImageEncoding) -> None:
-        message = image_to_proto(smooth_image(), encoding)
+        message = sent(smooth_image(), encoding)
         jpeg, png = pb.IMAGE_ENCODING_JPEG, pb.IMAGE_ENCODING_PNG
         message.encoding = png if message.encoding == jpeg else jpeg
         with pytest.raises(BadImage, match="expected a"):
@@ -140,14 +141,14 @@ class TestDamage:
 class TestSize:
     @pytest.mark.parametrize("encoding", FILES)
     def test_a_file_must_be_as_large_as_the_message_says(self, encoding: ImageEncoding) -> None:
-        message = image_to_proto(smooth_image(), encoding)
+        message = sent(smooth_image(), encoding)
         message.width = 60
         with pytest.raises(BadImage, match=r"says 60x48, its (JPEG|PNG) is 64x48"):
             image_from_proto(message)
 
     @pytest.mark.parametrize("size", [(0, 48), (64, 0)], ids=["no width", "no height"])
     def test_a_size_is_needed(self, size: tuple[int, int]) -> None:
-        message = image_to_proto(smooth_image(), ImageEncoding.RAW)
+        message = sent(smooth_image(), ImageEncoding.RAW)
         message.width, message.height = size
         with pytest.raises(BadImage, match="expected a size"):
             image_from_proto(message)
@@ -155,7 +156,7 @@ class TestSize:
     @given(st.integers(-1, 1).filter(bool), st.sampled_from([1, 3]))
     def test_raw_rows_must_fill_the_image_exactly(self, difference: int, channels: int) -> None:
         image = smooth_image() if channels == 3 else smooth_image()[..., 0]
-        message = image_to_proto(image, ImageEncoding.RAW)
+        message = sent(image, ImageEncoding.RAW)
         message.data = message.data[:-1] if difference < 0 else message.data + b"\0"
         with pytest.raises(BadImage, match=f"is {48 * 64 * channels} bytes"):
             image_from_proto(message)
@@ -174,7 +175,7 @@ class TestSize:
 
     @pytest.mark.parametrize("encoding", [pb.IMAGE_ENCODING_UNSPECIFIED, 99])
     def test_an_unknown_encoding_is_named(self, encoding: pb.ImageEncoding) -> None:
-        message = image_to_proto(smooth_image(), ImageEncoding.RAW)
+        message = sent(smooth_image(), ImageEncoding.RAW)
         message.encoding = encoding
         with pytest.raises(BadImage, match=f"got {encoding}"):
             image_from_proto(message)

@@ -14,9 +14,7 @@ from tests.support.frames import RIG, frame_message, make_frame, open_message
 from tests.support.models import NOT_FINITE, RAISES, RecallModel
 from tests.support.server import RawCall, connected, raw_stream, running_server
 from tests.support.status import reason_of
-from vergence_proto import codec
 from vergence_proto.errors import ERROR_CLASSES, BadImage, BadPose, ErrorCode
-from vergence_proto.types import ImageEncoding
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.transports.grpc_errors import GRPC_STATUS
 
@@ -49,7 +47,7 @@ def truncated_jpeg(frame: pb.Frame) -> None:
 
 def wrong_size(frame: pb.Frame) -> None:
     small = make_frame(2, rig=replace(RIG, height=24))
-    frame.CopyFrom(codec.frame_to_proto(small, encoding=ImageEncoding.RAW))
+    frame.CopyFrom(frame_message(small).frame)
 
 
 def different_sizes(frame: pb.Frame) -> None:

@@ -28,8 +28,8 @@ def make_frame(frame_id: int, *, brightness: int = 64, rig: RectifiedRig = RIG) 
 
 
 def frame_message(frame: StereoFrame, *, max_age_s: float | None = None) -> pb.StreamDepthRequest:
-    message = codec.frame_to_proto(frame, encoding=ImageEncoding.RAW, max_age_s=max_age_s)
-    return pb.StreamDepthRequest(frame=message)
+    request = codec.frame_to_request(frame, encoding=ImageEncoding.RAW, max_age_s=max_age_s)
+    return pb.StreamDepthRequest.FromString(request)
 
 
 def open_message(

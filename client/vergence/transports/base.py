@@ -17,8 +17,8 @@ class ConnectionLost(NotReady):
 class Call(Protocol):
     """One attachment to a stream: requests go up, responses come down, each in order."""
 
-    async def send(self, request: pb.StreamDepthRequest) -> None:
-        """Hand over one message, waiting while the way is full.
+    async def send(self, request: bytes) -> None:
+        """Hand over one ``pb.StreamDepthRequest``, serialized, waiting while the way is full.
 
         A message to a call that has ended is lost without a word here: ``receive`` says why.
         """

@@ -47,7 +47,7 @@ class GrpcTransport:
     async def open_call(self, stream_id: str) -> Call:
         start = self._channel.stream_stream(
             f"{_SERVICE}StreamDepth",
-            request_serializer=pb.StreamDepthRequest.SerializeToString,
+            request_serializer=bytes,  # they come serialized
             response_deserializer=pb.StreamDepthResponse.FromString,
         )
         call = start(request_iterator=None, metadata=((STREAM_ID_METADATA, stream_id),))
@@ -72,7 +72,7 @@ class GrpcTransport:
 class _GrpcCall:
     def __init__(
         self,
-        call: "grpc.aio.StreamStreamCall[pb.StreamDepthRequest, pb.StreamDepthResponse]",
+        call: "grpc.aio.StreamStreamCall[bytes, pb.StreamDepthResponse]",
         address: str,
     ) -> None:
         self._call = call
@@ -82,7 +82,7 @@ class _GrpcCall:
         self._status = asyncio.get_running_loop().create_future()
         call.add_done_callback(self._keep_status)
 
-    async def send(self, request: pb.StreamDepthRequest) -> None:
+    async def send(self, request: bytes) -> None:
         # Both mean that the call has ended: before this write, or during it.
         with contextlib.suppress(asyncio.InvalidStateError, grpc.aio.AioRpcError):
             await self._call.write(request)
@@ -122,7 +122,7 @@ class _GrpcCall:
 
 
 def _status_of(
-    call: "grpc.aio.StreamStreamCall[pb.StreamDepthRequest, pb.StreamDepthResponse]",
+    call: "grpc.aio.StreamStreamCall[bytes, pb.StreamDepthResponse]",
 ) -> grpc.aio.AioRpcError:
     """Of a call that has ended: there is nothing to wait for, so this need not be awaited."""
 

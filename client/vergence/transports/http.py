@@ -66,16 +66,15 @@ class _HttpCall:
         self._records: deque[tuple[RecordKind, bytes]] = deque()
         self._error: DepthError | None = None  # for receive to raise
 
-    async def send(self, request: pb.StreamDepthRequest) -> None:
-        content = request.SerializeToString()
+    async def send(self, request: bytes) -> None:
         try:
             if self._answer is None:
-                await self._open(content)
+                await self._open(request)
             elif self._error is None:
                 call_id = self._answer.headers[CALL_ID_HEADER]
                 # What is wrong with it is told by the call's own answer.
                 await self._http.post(
-                    f"/v1/streams/{call_id}", content=content, headers=self._headers
+                    f"/v1/streams/{call_id}", content=request, headers=self._headers
                 )
         except httpx.TransportError as error:
             self._error = _lost(self._http, error)
@@ -103,11 +102,11 @@ class _HttpCall:
         if self._answer is not None:
             await self._answer.aclose()
 
-    async def _open(self, content: bytes) -> None:
-        request = self._http.build_request(
-            "POST", "/v1/streams", content=content, headers=self._headers
+    async def _open(self, request: bytes) -> None:
+        post = self._http.build_request(
+            "POST", "/v1/streams", content=request, headers=self._headers
         )
-        answer = await self._http.send(request, stream=True)
+        answer = await self._http.send(post, stream=True)
         if answer.is_error:
             await answer.aread()
             self._error = _error_of(answer)

@@ -68,19 +68,20 @@ class ZenohCall:
         self._max_frame_bytes = 0
         self._unanswered = Unanswered()
 
-    async def send(self, request: pb.StreamDepthRequest) -> None:
+    async def send(self, request: bytes) -> None:
+        message = pb.StreamDepthRequest.FromString(request)
         try:
-            match request.WhichOneof("message"):
+            match message.WhichOneof("message"):
                 case "open":
-                    await self._open(request.open)
+                    await self._open(message.open)
                 case "frame":
-                    await self._send_frame(request.frame)
+                    await self._send_frame(message.frame)
                 case "ping":
-                    await self._send_ping(request.ping)
+                    await self._send_ping(message.ping)
                 case "reset":
-                    await self._put(request.reset)
+                    await self._put(message.reset)
                 case "end":
-                    await self._put(request.end)
+                    await self._put(message.end)
         except zenoh.ZError as error:
             self.lose(reason_of(error))
         except DepthError as error:

@@ -13,7 +13,7 @@ from vergence_proto.codec.frames import (
     error_from_frame_error,
     error_to_frame_error,
     frame_from_proto,
-    frame_to_proto,
+    frame_to_request,
     origin_from_proto,
     origin_to_proto,
     output_format_from_proto,
@@ -21,7 +21,7 @@ from vergence_proto.codec.frames import (
     timings_from_proto,
     timings_to_proto,
 )
-from vergence_proto.codec.images import image_from_proto, image_to_proto
+from vergence_proto.codec.images import image_from_proto, image_to_wire
 from vergence_proto.codec.planes import plane_from_proto, plane_to_proto
 from vergence_proto.codec.rigs import (
     axes_from_proto,
@@ -49,9 +49,9 @@ __all__ = [
     "error_to_frame_error",
     "error_to_status",
     "frame_from_proto",
-    "frame_to_proto",
+    "frame_to_request",
     "image_from_proto",
-    "image_to_proto",
+    "image_to_wire",
     "origin_from_proto",
     "origin_to_proto",
     "output_format_from_proto",

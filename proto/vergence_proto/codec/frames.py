@@ -10,7 +10,7 @@ from vergence_proto.codec.enums import (
     number_of,
     value_of,
 )
-from vergence_proto.codec.images import image_from_proto, image_to_proto
+from vergence_proto.codec.images import image_from_proto, image_to_wire
 from vergence_proto.codec.planes import (
     bytes_plane_from_proto,
     bytes_plane_to_proto,
@@ -24,6 +24,7 @@ from vergence_proto.codec.rigs import (
     pose_sample_to_proto,
     pose_to_proto,
 )
+from vergence_proto.codec.wire import Piece, delimited
 from vergence_proto.errors import BadImage, BadShape, DepthError, FrameTooLarge, error_from_wire
 from vergence_proto.geometry import RectifiedRig
 from vergence_proto.types import (
@@ -42,27 +43,27 @@ _MICROSECONDS = 1e6
 _LARGEST_UINT32 = 2**32 - 1
 
 
-def frame_to_proto(
+def frame_to_request(
     frame: StereoFrame,
     *,
     encoding: ImageEncoding,
     jpeg_quality: int = 90,
     max_age_s: float | None = None,
-    into: pb.Frame | None = None,
-) -> pb.Frame:
-    """Encode a pair; ``into`` the field of a larger message if it is to be one, to save a copy.
+) -> bytes:
+    """Encode a pair as a ``pb.StreamDepthRequest``, serialized; its images are copied only once.
 
     Raises BadImage or BadPose: the frame holds what no server would take.
     """
-    message = pb.Frame() if into is None else into
-    message.frame_id, message.capture_ns = frame.frame_id, frame.capture_ns
-    for image, field in ((frame.left, message.left), (frame.right, message.right)):
-        image_to_proto(image, encoding, jpeg_quality=jpeg_quality, into=field)
-    if max_age_s is not None:
-        message.max_age_s = max_age_s
+    message = pb.Frame(frame_id=frame.frame_id, capture_ns=frame.capture_ns, max_age_s=max_age_s)
     if frame.pose is not None:
         message.pose.CopyFrom(pose_sample_to_proto(frame.pose))
-    return message
+    pieces: list[Piece] = [message.SerializeToString()]
+    for image, number in (
+        (frame.left, pb.Frame.LEFT_FIELD_NUMBER),
+        (frame.right, pb.Frame.RIGHT_FIELD_NUMBER),
+    ):
+        pieces += delimited(number, *image_to_wire(image, encoding, jpeg_quality=jpeg_quality))
+    return b"".join(delimited(pb.StreamDepthRequest.FRAME_FIELD_NUMBER, *pieces))
 
 
 def frame_from_proto(

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vergence_proto.codec.wire import Piece, delimited
 from vergence_proto.errors import BadImage
 from vergence_proto.types import Image, ImageEncoding
 from vergence_proto.v1 import depth_pb2 as pb
@@ -30,18 +31,12 @@ _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_BARE = frozenset({0x01, *range(0xD0, 0xDA)})
 
 
-def image_to_proto(
-    image: NDArray[np.uint8],
-    encoding: ImageEncoding,
-    *,
-    jpeg_quality: int = 90,
-    into: pb.Image | None = None,
-) -> pb.Image:
-    """Encode uint8 [H, W, 3] RGB, or [H, W] grey, which travels at a third of the size.
+def image_to_wire(
+    image: NDArray[np.uint8], encoding: ImageEncoding, *, jpeg_quality: int = 90
+) -> list[Piece]:
+    """A ``pb.Image`` in pieces: uint8 [H, W, 3] RGB, or [H, W] grey at a third of the size.
 
-    ``into`` is a field of a larger message: protobuf copies a message that is set as a field, and
-    an image is a megabyte.
-    Raises BadImage: another type or shape.
+    The pieces may look at the image itself. Raises BadImage: another type or shape.
     """
     if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)):
         raise BadImage(
@@ -53,16 +48,15 @@ def image_to_proto(
     match encoding:
         case ImageEncoding.RAW:
             kind = pb.IMAGE_ENCODING_MONO8 if image.ndim == 2 else pb.IMAGE_ENCODING_RGB8
-            data = image.tobytes()
+            data: Piece = np.ascontiguousarray(image).data.cast("B")
         case ImageEncoding.JPEG:
             kind = pb.IMAGE_ENCODING_JPEG
             data = _encoded(image, ".jpg", [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality])
         case ImageEncoding.PNG:
             kind = pb.IMAGE_ENCODING_PNG
             data = _encoded(image, ".png", [cv2.IMWRITE_PNG_COMPRESSION, 1])  # 1: the quickest
-    message = pb.Image() if into is None else into
-    message.encoding, message.width, message.height, message.data = kind, width, height, data
-    return message
+    header = pb.Image(encoding=kind, width=width, height=height)
+    return [header.SerializeToString(), *delimited(pb.Image.DATA_FIELD_NUMBER, data)]
 
 
 def image_from_proto(message: pb.Image, data: bytes | None = None) -> Image:
