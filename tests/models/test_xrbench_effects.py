@@ -168,7 +168,7 @@ class TestFinalPass:
     def test_rows_show_the_moment_at_which_they_are_read(self) -> None:
         """Read for two frames' time: the top is a frame old, the bottom a frame ahead."""
         late = dataclasses.replace(STILL, readout_s=2 / 30, exposure_s=0.5 / 30)
-        recipe = Recipe("office", speed=10, width=32, height=32, samples=60, effects=late)
+        recipe = Recipe("studio", speed=10, width=32, height=32, samples=30, effects=late)
         camera = StereoCamera(recipe, variant="scalar_rgb")
         rolled = camera.final(4, Eye.LEFT).astype(int)
         moments = {k: np.abs(camera.clean(4 + k, Eye.LEFT) - rolled) for k in (-1, 0, 1)}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -24,6 +25,25 @@ from vergence_models.data.xrbench.writer import render_sequence
 from vergence_proto.layouts import open_source
 
 TINY = Recipe("studio", frames=1, width=32, height=24, samples=4, fps=20, baseline_m=0.07)
+
+
+@pytest.fixture(scope="module")
+def camera() -> StereoCamera:
+    """What films TINY, however many frames of it."""
+    return StereoCamera(TINY, variant="scalar_rgb")
+
+
+@pytest.fixture(scope="module")
+def rendered_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("tiny")
+    render_sequence(TINY, out, passes=("clean",), variant="scalar_rgb")
+    return out
+
+
+@pytest.fixture
+def rendered(rendered_once: Path, tmp_path: Path) -> Path:
+    """The clean pass of TINY, in a folder of the test's own."""
+    return shutil.copytree(rendered_once, tmp_path / "tiny")
 
 
 def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -127,11 +147,10 @@ def test_at_six_times_the_speed_a_frame_is_six_frames_on() -> None:
         )
 
 
-def test_what_is_written_reads_as_sceneflow(tmp_path: Path) -> None:
+def test_what_is_written_reads_as_sceneflow(camera: StereoCamera, tmp_path: Path) -> None:
     recipe = dataclasses.replace(TINY, frames=2)
     folder = render_sequence(recipe, tmp_path, variant="scalar_rgb")
     assert folder == tmp_path / "frames_finalpass" / recipe.name
-    camera = StereoCamera(recipe, variant="scalar_rgb")
     for which in ("clean", "final"):
         source = open_source(f"sceneflow:{tmp_path}/frames_{which}pass/{recipe.name}")
         assert (len(source), source.fps, source.metric) == (2, 20, True)
@@ -158,18 +177,18 @@ def test_what_is_written_reads_as_sceneflow(tmp_path: Path) -> None:
     np.testing.assert_array_equal(sheet[:24, :32], camera.clean(0, Eye.LEFT))
 
 
-def test_every_file_of_a_frame_holds_what_is_known_of_it(tmp_path: Path) -> None:
-    render_sequence(TINY, tmp_path, passes=("clean",), variant="scalar_rgb")
-    camera = StereoCamera(TINY, variant="scalar_rgb")
+def test_every_file_of_a_frame_holds_what_is_known_of_it(
+    camera: StereoCamera, rendered: Path
+) -> None:
     truth, name = camera.truth(0), TINY.name
 
     def picture(kind: str) -> NDArray[np.generic]:
-        path = tmp_path / kind / name / "left" / "0000.png"
+        path = rendered / kind / name / "left" / "0000.png"
         return np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
 
     def pfm(path: str) -> NDArray[np.float32]:
         """By OpenCV's reader, not ours."""
-        return np.asarray(cv2.imread(str(tmp_path / path), cv2.IMREAD_UNCHANGED))
+        return np.asarray(cv2.imread(str(rendered / path), cv2.IMREAD_UNCHANGED))
 
     np.testing.assert_array_equal(picture("object_index"), truth.label)
     np.testing.assert_array_equal(picture("specular") != 0, truth.specular)
@@ -183,9 +202,9 @@ def test_every_file_of_a_frame_holds_what_is_known_of_it(tmp_path: Path) -> None
         flow = pfm(f"optical_flow/{name}/{file}")[..., ::-1]  # OpenCV turns channels around
         np.testing.assert_array_equal(flow[..., :2], motion.flow_px)
         assert (flow[..., 2] == 0).all()
-    boxes = tmp_path / "object_boxes" / name / "0000.json"
+    boxes = rendered / "object_boxes" / name / "0000.json"
     assert json.loads(boxes.read_text()) == truth.boxes
-    rays = np.load(tmp_path / "rays" / name / "left.npy")
+    rays = np.load(rendered / "rays" / name / "left.npy")
     np.testing.assert_array_equal(rays, truths.rays(camera.optics))
 
 
@@ -205,35 +224,33 @@ def test_the_sample_that_is_shipped_is_what_its_recipe_renders() -> None:
         assert (error_px < 1e-3).mean() > 0.999
 
 
-def test_a_stopped_run_goes_on_and_keeps_what_is_there(tmp_path: Path) -> None:
-    render_sequence(TINY, tmp_path, passes=("clean",), variant="scalar_rgb")
-    first = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*0000*") if path.is_file()}
-    lost = tmp_path / "frames_cleanpass" / TINY.name / "left" / "0000.png"
+def test_a_stopped_run_goes_on_and_keeps_what_is_there(rendered: Path) -> None:
+    first = {path: path.stat().st_mtime_ns for path in rendered.rglob("*0000*") if path.is_file()}
+    lost = rendered / "frames_cleanpass" / TINY.name / "left" / "0000.png"
     assert len(first) > 8
 
     told: list[int] = []
     longer = dataclasses.replace(TINY, frames=2)
     render_sequence(
-        longer, tmp_path, passes=("clean",), variant="scalar_rgb", on_frame=lambda: told.append(1)
+        longer, rendered, passes=("clean",), variant="scalar_rgb", on_frame=lambda: told.append(1)
     )
     assert len(told) == 2
     assert {path: path.stat().st_mtime_ns for path in first} == first
-    assert (tmp_path / "disparity" / TINY.name / "right" / "0001.pfm").exists()
+    assert (rendered / "disparity" / TINY.name / "right" / "0001.pfm").exists()
 
     image = lost.read_bytes()
     lost.unlink()
-    render_sequence(TINY, tmp_path, passes=("clean",), variant="scalar_rgb")
+    render_sequence(TINY, rendered, passes=("clean",), variant="scalar_rgb")
     assert lost.read_bytes() == image  # the same recipe, the same picture
     # Fewer frames were asked for than are there: those that are there keep their poses.
-    source = open_source(f"sceneflow:{tmp_path}/frames_cleanpass/{TINY.name}")
+    source = open_source(f"sceneflow:{rendered}/frames_cleanpass/{TINY.name}")
     assert [each.frame.pose is not None for each in source] == [True, True]
 
 
-def test_another_recipe_may_not_mix_with_a_sequence_that_is_there(tmp_path: Path) -> None:
-    render_sequence(TINY, tmp_path, passes=("clean",), variant="scalar_rgb")
+def test_another_recipe_may_not_mix_with_a_sequence_that_is_there(rendered: Path) -> None:
     brighter = dataclasses.replace(TINY, samples=5)
     with pytest.raises(BadRecipe, match="is another recipe"):
-        render_sequence(brighter, tmp_path, passes=("clean",), variant="scalar_rgb")
+        render_sequence(brighter, rendered, passes=("clean",), variant="scalar_rgb")
 
 
 class TestCommand:
