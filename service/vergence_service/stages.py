@@ -2,9 +2,8 @@
 
 The graphs of a stage run side by side, on threads of their own. Where a network has large parts
 that do not need each other, that is as quick as to divide every operator between the same threads,
-for less work: the threads meet once a stage and each keeps to its own cache. A graph that has a
-stage to itself shares its operators between all threads, if the step is alone. While several steps
-are taken at once it is they that run side by side, each graph after graph on a thread of its own.
+for less work: the threads meet once a stage and each keeps to its own cache. While several steps
+are taken at once it is they that run side by side, each graph after graph.
 """
 
 import logging
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 from onnxruntime import InferenceSession, SessionOptions
 
 from vergence_proto.model_io import DISPARITY, SIGMA, ManifestError, ModelCard
-from vergence_service.providers import PROVIDERS, Resident, Tensor, run_on_device, start_session
+from vergence_service.providers import Resident, Tensor, run_on_device, start_session
 
 log = logging.getLogger(__name__)
 
@@ -56,14 +55,8 @@ class _Part:
         return dict(zip(names, [*host, *stayed], strict=True))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Stage:
-    together: list[_Part]  # of a step beside others: a thread for each graph
-    alone: list[_Part]  # of a step that has all threads to itself: the same graphs
-
-
 class StagedGraphs:
-    """The graphs of a model, each loaded once, or once more for steps that are alone.
+    """The graphs of a model, each loaded once.
 
     ``providers`` are onnxruntime's names. Steps use ``threads`` threads, 0 for one a core. As many
     of them as ``lanes`` may run at once: one that is alone runs the graphs of a stage side by side,
@@ -84,19 +77,15 @@ class StagedGraphs:
         self._providers = providers
         self._allow_spinning = allow_spinning
         self._device = device
-        self._sessions: dict[tuple[Path, int], InferenceSession] = {}
-        self._steps: dict[int, list[_Stage]] = {}
+        self._sessions: dict[Path, InferenceSession] = {}
+        self._steps: dict[int, list[list[_Part]]] = {}
         width = max(len(stage) for stages in card.graphs.values() for stage in stages)
         self.lanes = min(threads or _cores(), width)
-        # A model that is cut for several threads leaves each of them its own graph while several
-        # steps are taken. A step that is alone shares the last graph of `lite` between both, too,
-        # operator by operator: the maps of a lone 30 Hz stream came in 33 ms instead of 42, for a
-        # sixth more work, which would slow down a neighbour. Other providers than the CPU's have
-        # threads of their own.
-        cut = width > 1
-        shares = cut and device is None and providers[0] == PROVIDERS["cpu"]
-        self._graph_threads = max(1, (threads or _cores()) // width) if cut else threads
-        self._lone_graph_threads = threads if shares else self._graph_threads
+        # A model that is cut for several threads leaves each of them its own graph, also in stages
+        # of one: two threads that shared the last graph of `lite`, operator by operator, took 15 %
+        # less time but a fifth more work, while another stream's step can use the second thread
+        # whole. Alone: onnxruntime knows best what "one a core" is.
+        self._operator_threads = max(1, (threads or _cores()) // width) if width > 1 else threads
         self._beside = ThreadPoolExecutor(self.lanes, thread_name_prefix="graph")
         self._running = 0
         self._counting = threading.Lock()
@@ -113,29 +102,23 @@ class StagedGraphs:
                 self._steps[iterations] = self._loaded(iterations)
                 log.info("loaded %s, %d iterations", self._card.name, iterations)
 
-    def _loaded(self, iterations: int) -> list[_Stage]:
-        graphs = self._card.graphs[iterations]
-        sessions = [
-            [self._session(graph, self._graph_threads) for graph in each] for each in graphs
-        ]
-        _require_fit(self._card, iterations, sessions)
+    def _loaded(self, iterations: int) -> list[list[_Part]]:
+        stages = [[*map(self._session, stage)] for stage in self._card.graphs[iterations]]
+        _require_fit(self._card, iterations, stages)
         needed = set(self._card.output_names)
-        stages: list[_Stage] = []
-        for paths, stage in zip(reversed(graphs), reversed(sessions), strict=True):
-            together = alone = [_Part.of(session, needed) for session in stage]
-            if len(stage) == 1:
-                alone = [_Part.of(self._session(paths[0], self._lone_graph_threads), needed)]
-            stages.insert(0, _Stage(together, alone))
-            needed.update(name for part in together for name in part.inputs)
-        return stages
+        parts: list[list[_Part]] = []
+        for stage in reversed(stages):
+            parts.insert(0, [_Part.of(session, needed) for session in stage])
+            needed.update(name for part in parts[0] for name in part.inputs)
+        return parts
 
     def run(self, iterations: int, given: Tensors) -> dict[str, Tensor]:
         """One step of a batch: the card's inputs to the card's outputs, by name."""
         self.load(iterations)
         found: dict[str, Tensor] = {}
         with self._counted():
-            for stage in self._steps[iterations]:
-                for outputs in self._run_stage(stage, {**given, **found}):
+            for parts in self._steps[iterations]:
+                for outputs in self._run_stage(parts, {**given, **found}):
                     found |= outputs
         return {name: found[name] for name in self._card.output_names}
 
@@ -149,10 +132,10 @@ class StagedGraphs:
             with self._counting:
                 self._running -= 1
 
-    def _run_stage(self, stage: _Stage, tensors: Tensors) -> list[dict[str, Tensor]]:
+    def _run_stage(self, parts: Sequence[_Part], tensors: Tensors) -> list[dict[str, Tensor]]:
         if self.lanes == 1 or self._running > 1:
-            return [part.run(tensors, self._device) for part in stage.together]
-        first, *others = stage.alone  # the caller's thread takes a graph as well
+            return [part.run(tensors, self._device) for part in parts]
+        first, *others = parts  # the caller's thread takes a graph as well
         futures: list[Future[dict[str, Tensor]]] = []
         try:
             futures += (self._beside.submit(part.run, tensors, self._device) for part in others)
@@ -161,10 +144,10 @@ class StagedGraphs:
             wait(futures)  # also where one fails: no graph runs on into the next step
         return [outputs, *(future.result() for future in futures)]
 
-    def _session(self, graph: Path, threads: int) -> InferenceSession:
-        if (graph, threads) not in self._sessions:
+    def _session(self, graph: Path) -> InferenceSession:
+        if graph not in self._sessions:
             options = SessionOptions()
-            options.intra_op_num_threads = threads
+            options.intra_op_num_threads = self._operator_threads
             # Planning the reuse of buffers took a second of a long graph's start and saved no
             # memory: the arena gives freed buffers out again without a plan, and steps are as
             # quick.
@@ -172,8 +155,8 @@ class StagedGraphs:
             if not self._allow_spinning:
                 # As long as the next operator of a step may take to come, never between steps.
                 options.add_session_config_entry("session.intra_op.spin_duration_us", "20")
-            self._sessions[graph, threads] = start_session(graph, options, self._providers)
-        return self._sessions[graph, threads]
+            self._sessions[graph] = start_session(graph, options, self._providers)
+        return self._sessions[graph]
 
 
 def _require_fit(
