@@ -96,7 +96,12 @@ class Config:
 # Windows of a sharper camera need less blowing up; a stereo pair alone has to be good too, with
 # more iterations than a stream starts with.
 LITE_TRAINING = TrainingConfig(
-    frames=6, decay_steps=29_000, stretch_share=0.3, reset_share=0.25, cold_iterations=6
+    frames=5,
+    decay_steps=36_000,
+    ema_decay=0.999,
+    stretch_share=0.3,
+    reset_share=0.3,
+    cold_iterations=6,
 )
 # The paper's: Adam, no weight decay, an L1 loss that weighs every frame alike.
 RAFT_TRAINING = TrainingConfig(

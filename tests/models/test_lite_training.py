@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.models.clips import wall_clips
+from vergence_models.data.generator import ClipGenerator, GeneratorConfig
 from vergence_models.data.pool import ClipPool, write_shard
 from vergence_models.lite.hypotheses import Hypotheses
 from vergence_models.studies.parts import PARTS, main, table_of_parts
@@ -69,7 +70,10 @@ def test_likelihood_counts_known_truth_alone() -> None:
 def test_each_part_is_measured_beside_the_whole(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_shard(tmp_path / "pool" / "shard_1_000000", wall_clips(1))
+    # A scene with edges: on a wall the first guess is as good as any other.
+    config = GeneratorConfig(width=192, height=128, frames=2, texture_size=64)
+    clips = ClipGenerator(config).clips(seed=3, indices=[0])
+    write_shard(tmp_path / "pool" / "shard_1_000000", clips)
     arguments = ["--run", str(RUN), "--val", str(tmp_path / "pool"), "--clips", "1"]
     main([*arguments, "--json", str(tmp_path / "out" / "parts.json")])
     assert "What each part of lite is worth" in capsys.readouterr().out

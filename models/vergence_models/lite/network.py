@@ -28,7 +28,8 @@ from vergence_models.lite.coarse import (
     CoarseUpdate,
     CostFilter,
     extremes,
-    peak,
+    peaks,
+    rims,
     smooth_fill,
 )
 from vergence_models.lite.context import Context
@@ -165,14 +166,15 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         hole8 = (seen8 <= 0).to(prior.dtype)
         prior8 = F.avg_pool2d(prior, 2) / seen8.clamp(min=0.1)
         scores = whole_rows(self.cost_filter(evidence.clues, evidence.context16, prior8))
-        guess = peak(scores)
-        confidence = torch.exp(4 * guess[1])
-        fill = smooth_fill(guess[0], confidence)
+        guess = peaks(scores)
+        best, confidence = guess[0][:, :1], torch.exp(4 * guess[1][:, :1])
+        fill = smooth_fill(best, confidence)
+        current = prior8 + hole8 * (fill - prior8)
         hidden, d, hypotheses = self.update(
             hidden,
-            prior8 + hole8 * (fill - prior8),
+            current,
             guess=guess,
-            fills=torch.cat((fill, extremes(guess[0], confidence, fill)), dim=1),
+            around=torch.cat((fill, extremes(best, confidence, fill), rims(current)), dim=1),
             hole=hole8,
             scores=scores,
             context=evidence.context8,

@@ -38,6 +38,16 @@ def rims_never_chosen(network: LiteNetwork) -> None:
     network.refinement.choose.bias[1:] = NEVER  # the first is the surface itself
 
 
+def never(*hypotheses: int) -> Callable[[LiteNetwork], None]:
+    """These are never chosen at 1/8; the cell goes on seeing them."""
+
+    def rule_out(network: LiteNetwork) -> None:
+        assert network.update.out.bias is not None
+        network.update.out.bias[list(hypotheses)] = NEVER
+
+    return rule_out
+
+
 def silenced(*layers: str) -> Callable[[LiteNetwork], None]:
     """Layers, or parameters, of these names answer zero."""
 
@@ -64,6 +74,8 @@ PARTS: dict[str, Callable[[LiteNetwork], None]] = {
     "1/8: scores do not know the image": silenced("cost_filter.context"),
     "1/8: scores do not know the previous surface": silenced("cost_filter.expected"),
     "1/8: no doubt about matches another surface claims": claims_unseen,
+    "1/8: neither the second peak nor a rim is chosen": never(2, 6, 7),
+    "1/8: neither the farthest nor the nearest around is chosen": never(4, 5),
     "1/4: no rims, only the surface of 1/8": rims_never_chosen,
     "1/4: no wider view": silenced("refinement.back"),
     "1/4: no sub-pixel fit": silenced("refinement.subpixel"),
