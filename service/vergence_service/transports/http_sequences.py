@@ -114,7 +114,8 @@ class SequenceJob(BaseModel):
         )
 
 
-_BINARY = {"schema": {"type": "string", "format": "binary"}}
+_FILE = {"type": "string", "format": "binary"}
+_BINARY = {"schema": _FILE}
 _UPLOAD: dict[str, Any] = {
     "requestBody": {
         "required": True,
@@ -125,15 +126,9 @@ _UPLOAD: dict[str, Any] = {
                     "type": "object",
                     "description": "either archive alone, or the other three",
                     "properties": {
-                        "archive": {"type": "string", "format": "binary"},
-                        "left": {
-                            "type": "array",
-                            "items": {"type": "string", "format": "binary"},
-                        },
-                        "right": {
-                            "type": "array",
-                            "items": {"type": "string", "format": "binary"},
-                        },
+                        "archive": _FILE,
+                        "left": {"type": "array", "items": _FILE},
+                        "right": {"type": "array", "items": _FILE},
                         "sequence": {"$ref": "#/components/schemas/SequenceForm"},
                     },
                 },
