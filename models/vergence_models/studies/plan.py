@@ -46,7 +46,8 @@ def one_iteration(bench: Bench) -> list[tuple[Contender, Method]]:
 
 
 def training_of(contenders: Sequence[Contender]) -> list[str]:
-    return [contender.training.words for contender in contenders]
+    """Of those that have a row; a run whose every count is a graph too has none."""
+    return [each.training.words for each in contenders if each.warm or each.single_frame]
 
 
 def times(bench: Bench) -> Table:
