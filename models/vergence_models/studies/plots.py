@@ -29,6 +29,11 @@ def draw(axes: Axes, name: str, table: Table) -> None:
     if name == "runtime":
         draw_runtime(axes, table)
         return
+    from matplotlib import colormaps
+
+    # More than ten curves need more than ten colours; of its pairs the strong ones come first.
+    shades = [colormaps["tab20"](index) for index in (*range(0, 20, 2), *range(1, 20, 2))]
+    axes.set_prop_cycle(color=shades)
     highest = max(max(curve.epe) for curve in table.curves)
     for curve in table.curves:
         marker = "." if len(curve.x) < 15 else ""
@@ -42,7 +47,7 @@ def draw(axes: Axes, name: str, table: Table) -> None:
         axes.grid(which="both", linewidth=0.3)
     else:
         axes.set_ylim(0, 1.1 * highest)
-    axes.legend(fontsize=6, loc="upper right" if table.logarithmic else "lower right")
+    axes.legend(fontsize=6, loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
 
 
 def draw_runtime(axes: Axes, table: Table) -> None:
@@ -84,7 +89,7 @@ def draw_plots(tables: Sequence[Table], folder: Path) -> list[str]:
     if plots:
         rows = (len(plots) + 1) // 2
         figure, grid = plt.subplots(
-            rows, 2, figsize=(11, 3.9 * rows), layout="constrained", squeeze=False
+            rows, 2, figsize=(15, 3.9 * rows), layout="constrained", squeeze=False
         )
         for axes in grid.flat[len(plots) :]:
             axes.set_axis_off()
