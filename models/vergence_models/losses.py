@@ -13,7 +13,7 @@ def robust(error_px: Tensor) -> Tensor:
     """L1 with a logarithm: far outliers still pull, and halving a small error still pays.
 
     The last term (Geman and McClure 1987) is the share of bad pixels, over 2 px, made smooth:
-    errors of about that size pull most. With it that share fell by 4 to 8 %.
+    errors of about that size pull most.
     """
     square = error_px.square()
     return 0.25 * error_px + 1.5 * torch.log1p(error_px) + 6 * square / (square + 4)
