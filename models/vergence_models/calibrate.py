@@ -6,7 +6,7 @@ own state, so that the ranges are those of recurrent use.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 import onnxruntime
@@ -18,6 +18,7 @@ from vergence_models.data.pool import ClipPool
 from vergence_models.motion import uvd_transforms
 from vergence_models.quantization_plan import plan
 from vergence_models.quantize import Scale, copy_of, quantized, with_weights_apart
+from vergence_models.stitch import Kind
 from vergence_models.validation import filmed
 from vergence_proto.model_io import DISPARITY, LEFT, RIGHT, UVD_CURR_FROM_PREV, StateTensor
 
@@ -37,46 +38,55 @@ class QuantizationError(RuntimeError):
 
 
 def make_int8(
-    models: Mapping[int, ModelProto],
+    models: Mapping[Kind, ModelProto],
     states: Sequence[StateTensor],
     pool: ClipPool,
     *,
     max_disparity_px: float,
-) -> tuple[dict[int, ModelProto], dict[str, object]]:
-    """Int8 graphs of float ones, by iteration count, and the story for the manifest.
+) -> tuple[dict[Kind, ModelProto], dict[str, object]]:
+    """Int8 graphs of float ones, and the story for the manifest.
 
     Raises QuantizationError if the smallest loses more than :data:`MAX_LOSS`.
     """
     clips = filmed(pool, range(RANGE_CLIPS))
-    made: dict[int, ModelProto] = {}
+    made: dict[Kind, ModelProto] = {}
     story: dict[str, object] = {}
-    for count, whole in sorted(models.items()):
+    for kind, whole in sorted(models.items()):
         model = with_weights_apart(whole)
         what = plan(model)
-        int8 = quantized(model, what, find_scales(model, what.measured, states, clips))
+        seen = steps(model, states, clips, what.measured, forget=kind.closer > 0)
+        int8 = quantized(model, what, scales_of(seen, what.measured))
         if not made:
             before, after = (epe_px(each, states, pool, max_disparity_px) for each in (model, int8))
             if not after < MAX_LOSS * before:
                 raise QuantizationError(
-                    f"{count} iterations: EPE {after:.3f} px as int8, {before:.3f} px before; "
-                    f"expected less than {MAX_LOSS:g} times as much"
+                    f"{kind.iterations} iterations: EPE {after:.3f} px as int8, {before:.3f} px "
+                    f"before; expected less than {MAX_LOSS:g} times as much"
                 )
             story = {
                 "convolutions": len(what.convolutions),
                 "range_clips": RANGE_CLIPS,
                 "measured_clips": min(MEASURED_CLIPS, len(pool) - RANGE_CLIPS),
-                "iterations": count,
+                "iterations": kind.iterations,
                 "epe_px": round(after, 4),
                 "float_epe_px": round(before, 4),
             }
-        made[count] = int8
+        made[kind] = int8
     return made, story
 
 
 def steps(
-    model: ModelProto, states: Sequence[StateTensor], clips: StereoClips, names: Sequence[str]
+    model: ModelProto,
+    states: Sequence[StateTensor],
+    clips: StereoClips,
+    names: Sequence[str],
+    *,
+    forget: bool = False,
 ) -> Iterator[dict[str, Array]]:
-    """Step a graph through clips, the first frame cold: after every frame the named tensors."""
+    """Step a graph through clips: after every frame the named tensors.
+
+    The first frame starts cold, with ``forget`` every frame.
+    """
     model = copy_of(model)
     known = {output.name for output in model.graph.output}
     model.graph.output.extend(
@@ -99,18 +109,18 @@ def steps(
         images = {LEFT: left, RIGHT: right, UVD_CURR_FROM_PREV: matrices[:, frame]}
         found = session.run(wanted, {**images, **state})
         yield dict(zip(names, found, strict=False))
+        if forget:
+            continue
         state = {
             tensor.input_name: value
             for tensor, value in zip(states, found[len(names) :], strict=True)
         }
 
 
-def find_scales(
-    model: ModelProto, names: Sequence[str], states: Sequence[StateTensor], clips: StereoClips
-) -> dict[str, Scale]:
-    """For each tensor the scale that covers all that it holds while the graph sees the clips."""
+def scales_of(seen: Iterable[Mapping[str, Array]], names: Sequence[str]) -> dict[str, Scale]:
+    """For each tensor the scale that covers all that it holds."""
     low, high = dict.fromkeys(names, 0.0), dict.fromkeys(names, 0.0)
-    for found in steps(model, states, clips, names):
+    for found in seen:
         for name, values in found.items():
             low[name] = min(low[name], float(values.min()))
             high[name] = max(high[name], float(values.max()))

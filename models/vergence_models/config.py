@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -80,6 +81,7 @@ class TrainingConfig:
     reset_share: float = 0.1  # frames that lose their state
     foreign_share: float = 0.1  # frames whose state is in part another clip's of the batch
     cold_iterations: int = 4  # at most, drawn anew for every frame without a state
+    closer_share: float = 0.0  # of frames without a state, those that get a closer look
     precision: Precision = Precision.FP32
 
 
@@ -91,6 +93,8 @@ class Config:
     network: NetworkConfig
     training: TrainingConfig = field(default_factory=TrainingConfig)
     iterations: tuple[int, ...] = (1, 2, 4, 8)  # graphs to export
+    # Cold starts with graphs of their own: how many of their iterations are a closer look.
+    closer: Mapping[int, int] = field(default_factory=dict)
 
 
 # Windows of a sharper camera need less blowing up; a stereo pair alone has to be good too, with
@@ -102,6 +106,7 @@ LITE_TRAINING = TrainingConfig(
     stretch_share=0.3,
     reset_share=0.3,
     cold_iterations=6,
+    closer_share=0.2,
 )
 # The paper's: Adam, no weight decay, an L1 loss that weighs every frame alike.
 RAFT_TRAINING = TrainingConfig(
@@ -121,7 +126,7 @@ FAST_NETWORK = RaftNetworkConfig(
 CONFIGS = {
     config.name: config
     for config in (
-        Config("lite", LiteNetworkConfig(), LITE_TRAINING),
+        Config("lite", LiteNetworkConfig(), LITE_TRAINING, closer={8: 2}),
         Config("full", RaftNetworkConfig(), RAFT_TRAINING, iterations=(1, 2, 5, 7, 20)),
         Config("fast", FAST_NETWORK, RAFT_TRAINING, iterations=(1, 2, 5, 7, 20)),
     )

@@ -34,7 +34,7 @@ from vergence_models.raft.parts import parts_of as raft_parts_of
 from vergence_models.runs import Run, RunError, read_run
 from vergence_models.stages import handed_on, in_stages
 from vergence_models.stepping import OnnxNetwork, SteppedNetwork
-from vergence_models.stitch import Parts, stitched, write_with_shared_weights
+from vergence_models.stitch import CloserLook, Kind, Parts, stitched, write_with_shared_weights
 from vergence_models.tiers import AnyNetwork, trained_network
 from vergence_proto.model_io import MANIFEST_FORMAT, MANIFEST_NAME
 
@@ -65,6 +65,19 @@ def shifted_pair(
     return left[None].astype(np.uint8), right[None].astype(np.uint8)
 
 
+def check_cold_parity(network: AnyNetwork, graphs: SteppedNetwork, kind: Kind) -> float:
+    """As :func:`check_parity`, of a first step."""
+    height, width = 6 * network.config.stride, 8 * network.config.stride
+    left, right = shifted_pair(height, width, 0)
+    disparity, sigma, _ = graphs.start(left, right, kind.iterations)
+    with torch.inference_mode():
+        expected = network.cold_step(
+            torch.from_numpy(left), torch.from_numpy(right), kind.iterations, closer=kind.closer
+        )
+    worst = max(difference_px(disparity, expected.disparity), difference_px(sigma, expected.sigma))
+    return required(worst, graphs.card.name, kind)
+
+
 def check_parity(
     network: AnyNetwork, graphs: SteppedNetwork, iterations: int, *, frames: int = 3
 ) -> float:
@@ -89,14 +102,23 @@ def check_parity(
                 iterations,
             )
         for got, expected in ((disparity, estimate.disparity), (sigma, estimate.sigma)):
-            difference = np.abs(got - expected.numpy())
-            worst = max(worst, float(np.quantile(difference, 0.99)))
-    if not worst < PARITY_PX:
+            worst = max(worst, difference_px(got, expected))
+    return required(worst, graphs.card.name, Kind(iterations))
+
+
+def difference_px(got: NDArray[np.float32], expected: torch.Tensor) -> float:
+    """Of 99 % of pixels."""
+    return float(np.quantile(np.abs(got - expected.numpy()), 0.99))
+
+
+def required(difference: float, name: str, kind: Kind) -> float:
+    """The same. Raises ParityError if it is too large."""
+    if not difference < PARITY_PX:
         raise ParityError(
-            f"{graphs.card.name}, {iterations} iterations: differs from PyTorch by {worst:.2g} px "
-            f"at the 99th percentile, expected less than {PARITY_PX:g}"
+            f"{name}_{kind}: differs from PyTorch by {difference:.2g} px at the 99th percentile, "
+            f"expected less than {PARITY_PX:g}"
         )
-    return worst
+    return difference
 
 
 def export_run(run: Run, config: Config, out: Path, *, int8_clips: ClipPool | None = None) -> None:
@@ -106,7 +128,9 @@ def export_run(run: Run, config: Config, out: Path, *, int8_clips: ClipPool | No
     """
     network = trained_network(run)
     parts = exported_parts(network)
-    models = {count: stitched(parts, count) for count in config.iterations}
+    kinds = [Kind(count) for count in config.iterations]
+    kinds += [Kind(count, closer) for count, closer in config.closer.items()]
+    models = {kind: stitched(parts, kind) for kind in kinds}
     entry: dict[str, object] = {
         "stride": run.network.stride,
         "max_disparity_px": run.network.max_disparity_px,
@@ -119,9 +143,12 @@ def export_run(run: Run, config: Config, out: Path, *, int8_clips: ClipPool | No
     with TemporaryDirectory() as folder:
         write_model(Path(folder), config.name, models, parts, entry)
         graphs = OnnxNetwork(Path(folder), config.name)
-        for count in models:
-            worst = check_parity(network, graphs, count)
-            log.info("%s, %d iterations: within %.1e px of PyTorch", config.name, count, worst)
+        for kind in models:
+            if kind.closer:
+                worst = check_cold_parity(network, graphs, kind)
+            else:
+                worst = check_parity(network, graphs, kind.iterations)
+            log.info("%s_%s: within %.1e px of PyTorch", config.name, kind, worst)
     if int8_clips is not None:
         models, entry["int8"] = make_int8(
             models,
@@ -136,11 +163,11 @@ def export_run(run: Run, config: Config, out: Path, *, int8_clips: ClipPool | No
 def write_model(
     out: Path,
     name: str,
-    models: Mapping[int, ModelProto],
+    models: Mapping[Kind, ModelProto],
     parts: Parts[ModelProto],
     entry: Mapping[str, object],
 ) -> None:
-    """Write whole steps, by iteration count, as the files they are served from.
+    """Write whole steps as the files they are served from.
 
     A step with one graph in ``begin`` stays whole: one call is simple to serve, and nothing is
     handed from graph to graph. With the weights shared, five counts take little more room than one.
@@ -149,8 +176,8 @@ def write_model(
     """
     out.mkdir(parents=True, exist_ok=True)
     if len(parts.begin) == 1:
-        files = {f"{name}_{count}.onnx": model for count, model in models.items()}
-        stages = {count: [[file]] for count, file in zip(models, files, strict=True)}
+        files = {f"{name}_{kind}.onnx": model for kind, model in models.items()}
+        stages = {kind: [[file]] for kind, file in zip(models, files, strict=True)}
         shared = out / f"{name}.weights"
         write_with_shared_weights({out / file: model for file, model in files.items()}, shared)
         written = [*files, shared.name]
@@ -160,8 +187,12 @@ def write_model(
             onnx.save(model, out / file)
         written = [*files]
     digests = {file: hashlib.sha256((out / file).read_bytes()).hexdigest() for file in written}
-    graphs = {str(count): each for count, each in stages.items()}
-    write_entry(out / MANIFEST_NAME, name, {**entry, "graphs": graphs, "files": digests})
+    graphs, cold_graphs = (
+        {str(kind.iterations): each for kind, each in stages.items() if bool(kind.closer) == cold}
+        for cold in (False, True)
+    )
+    told = {**entry, "graphs": graphs, "cold_graphs": cold_graphs, "files": digests}
+    write_entry(out / MANIFEST_NAME, name, told)
 
 
 def exported_parts(network: AnyNetwork) -> Parts[ModelProto]:
@@ -180,10 +211,12 @@ def exported_parts(network: AnyNetwork) -> Parts[ModelProto]:
             export_part(part, path)
             return onnx.load(path)
 
+    look = parts.closer
     return Parts(
         tuple(exported(part) for part in parts.begin),
         exported(parts.iterate),
         exported(parts.end),
+        None if look is None else CloserLook(exported(look.enter), look.moved, exported(look.join)),
     )
 
 

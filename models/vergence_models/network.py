@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Generic, TypeAlias, TypeVar
+from typing import Generic, NamedTuple, TypeAlias, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -35,6 +35,14 @@ class Estimate(ABC):
         """The loss of this step against ``truth_px`` [B, H, W] (0 = unknown), a scalar."""
 
 
+class Found(NamedTuple):
+    """What a step gives to whoever has no use for more: the outputs of an exported graph."""
+
+    disparity: Tensor  # float32 [B, H, W], px
+    sigma: Tensor  # likewise
+    state: State
+
+
 class StereoNetwork(nn.Module, ABC, Generic[ConfigT]):
     """The whole step. ``iterations`` is an argument: the weights are the same for every count."""
 
@@ -57,6 +65,27 @@ class StereoNetwork(nn.Module, ABC, Generic[ConfigT]):
         iterations: int,
     ) -> tuple[Estimate, State]:
         """One step. ``left`` and ``right`` uint8 [B, H, W, 3]; H and W multiples of the stride."""
+
+    def cold_step(self, left: Tensor, right: Tensor, iterations: int, *, closer: int = 0) -> Found:
+        """A step that knows of no frame before, the last ``closer`` iterations at twice the size.
+
+        Raises ValueError if the tier takes no closer look and is asked for one.
+        """
+        batch, height, width, _ = left.shape
+        still = torch.eye(4, device=left.device).repeat(batch, 1, 1)
+        nothing = self.cold_state(batch, height, width)
+        estimate, state = self(left, right, still, nothing, iterations - closer)
+        found = Found(estimate.disparity, estimate.sigma, state)
+        return self.closer_look(left, right, found, closer)[1] if closer else found
+
+    def closer_look(
+        self, left: Tensor, right: Tensor, found: Found, iterations: int
+    ) -> tuple[Estimate, Found]:
+        """More iterations on a step's images, at twice the size.
+
+        Gives the estimate at that size, and what it makes of what was ``found`` before.
+        """
+        raise ValueError(f"{type(self).__name__} takes no closer look, got {iterations} iterations")
 
     def cold_state(self, batch: int, height: int, width: int) -> State:
         """The state that knows nothing, for images of that size, where the weights are."""

@@ -90,6 +90,8 @@ def plan(model: ModelProto) -> Plan:
             of_bytes.add(result)
         elif node.op_type == "Cast" and node.input[0] in of_bytes:
             images[result] = node.input[0]
+        elif node.op_type == "Cast" and casts_to_bytes(node):
+            of_bytes.add(result)
     # What is copied or put together for such an operator alone is so as bytes.
     made_by = {name: node for node in model.graph.node for name in node.output}
     for node in reversed(model.graph.node):
@@ -99,3 +101,7 @@ def plan(model: ModelProto) -> Plan:
         if node.op_type in COPYING_OPS or (whole in made_by and made_by[whole].op_type == "Concat"):
             source.setdefault(whole, source[result])
     return Plan(frozenset(convolutions), frozenset(products), images, source, absorbed)
+
+
+def casts_to_bytes(node: NodeProto) -> bool:
+    return any(entry.name == "to" and entry.i == TensorProto.UINT8 for entry in node.attribute)

@@ -8,19 +8,19 @@ from itertools import chain
 from onnx import ModelProto, TensorProto, ValueInfoProto
 
 from vergence_models.quantize import BYTES
-from vergence_models.stitch import Parts
+from vergence_models.stitch import Kind, Parts
 
 
 class StageError(RuntimeError):
-    """What should be the same for all iteration counts is not."""
+    """What should be the same for all kinds of steps is not."""
 
 
 def in_stages(
-    name: str, models: Mapping[int, ModelProto], handed: Sequence[Sequence[ValueInfoProto]]
-) -> tuple[dict[int, list[list[str]]], dict[str, ModelProto]]:
-    """Cut whole steps into graphs that run side by side, the same for all counts, and the rest.
+    name: str, models: Mapping[Kind, ModelProto], handed: Sequence[Sequence[ValueInfoProto]]
+) -> tuple[dict[Kind, list[list[str]]], dict[str, ModelProto]]:
+    """Cut whole steps into graphs that run side by side, the same for all kinds, and the rest.
 
-    ``handed`` says what each of the former gives. Returns the stages of each count, by file, and
+    ``handed`` says what each of the former gives. Returns the stages of each kind, by file, and
     the files.
 
     Two graphs on a thread each keep two cores busy with hardly a word between them. The 400
@@ -28,18 +28,18 @@ def in_stages(
     processor time, and no less of the user's.
     """
     files: dict[str, ModelProto] = {}
-    stages: dict[int, list[list[str]]] = {}
-    for count, model in models.items():
+    stages: dict[Kind, list[list[str]]] = {}
+    for kind, model in models.items():
         made = {result for node in model.graph.node for result in node.output}
         passed = [[as_made(entry, made) for entry in group] for group in handed]
         first = [f"{name}_begin_{number}.onnx" for number in range(len(passed))]
         for file, group in zip(first, passed, strict=True):
             graph = cut_out(model, [], group)
             if files.setdefault(file, graph) != graph:
-                raise StageError(f"{file}: is another with {count} iterations than with fewer")
-        last = f"{name}_{count}.onnx"
+                raise StageError(f"{file}: is another in {name}_{kind} than in those before it")
+        last = f"{name}_{kind}.onnx"
         files[last] = cut_out(model, [*chain(*passed)], model.graph.output)
-        stages[count] = [first, [last]]
+        stages[kind] = [first, [last]]
     return stages, files
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from vergence_models.data.clips import StereoClips
 from vergence_proto.geometry import Pose, RectifiedRig, uvd_curr_from_prev
 from vergence_proto.layouts import LayoutError, StereoSource
-from vergence_proto.model_io import ModelCard, load_model_card
+from vergence_proto.model_io import ModelCard, Stages, load_model_card
 
 Image = NDArray[np.uint8]
 Plane = NDArray[np.float32]
@@ -88,6 +88,7 @@ class Prediction:
     sigma_px: Plane | None = None  # [H, W]; None: the method does not tell
 
 
+NO_MOTION = np.eye(4, dtype=np.float32)
 State = tuple[Plane, ...]  # each [1, C, h, w], in the order of the card
 
 
@@ -107,6 +108,10 @@ class SteppedNetwork(ABC):
     ) -> tuple[Plane, Plane, State]:
         """One step of a batch: disparity, sigma [B, H, W] and the next state."""
 
+    @abstractmethod
+    def start(self, left: Image, right: Image, iterations: int) -> tuple[Plane, Plane, State]:
+        """As :meth:`run`, of frames that nothing is known before."""
+
     def cold_state(self, height: int, width: int, batch: int = 1) -> State:
         """All zeros, for images of a size that ``card.step_size`` gives."""
         return tuple(
@@ -124,15 +129,14 @@ class SteppedNetwork(ABC):
         for view in footage.views:
             height, width = view.left.shape[:2]
             left, right = (self.card.grown(image)[None] for image in (view.left, view.right))
-            matrix = np.eye(4, dtype=np.float32)
             if state is None or warm is None:
-                state, count = self.cold_state(*left.shape[1:3]), cold
+                disparity, sigma, state = self.start(left, right, cold)
             else:
-                count = warm
+                matrix = NO_MOTION
                 if previous is not None and view.world_from_left is not None:
                     curr_from_prev = view.world_from_left.inverse() @ previous
                     matrix = uvd_curr_from_prev(footage.rig, curr_from_prev)
-            disparity, sigma, state = self.run(left, right, matrix[None], state, count)
+                disparity, sigma, state = self.run(left, right, matrix[None], state, warm)
             previous = view.world_from_left
             yield Prediction(disparity[0, :height, :width], sigma[0, :height, :width])
 
@@ -147,7 +151,8 @@ class OnnxNetwork(SteppedNetwork):
     def __init__(self, weights: Path, name: str, *, threads: int = 2) -> None:
         """Raises ManifestError: no such model, or a file of it is damaged."""
         self.card = load_model_card(weights, name)
-        stages = [stage for stages in self.card.graphs.values() for stage in stages]
+        steps = (*self.card.graphs.values(), *self.card.cold_graphs.values())
+        stages = [*chain(*steps)]
         side_by_side = max(map(len, stages))
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = max(1, threads // side_by_side)
@@ -169,7 +174,17 @@ class OnnxNetwork(SteppedNetwork):
         state: State,
         iterations: int,
     ) -> tuple[Plane, Plane, State]:
-        given = (left, right, uvd_curr_from_prev, *state)
+        return self._run(
+            self.card.stages(iterations, cold=False), left, right, uvd_curr_from_prev, *state
+        )
+
+    def start(self, left: Image, right: Image, iterations: int) -> tuple[Plane, Plane, State]:
+        batch, height, width, _ = left.shape
+        still = NO_MOTION[None].repeat(batch, axis=0)
+        nothing = self.cold_state(height, width, batch)
+        return self._run(self.card.stages(iterations, cold=True), left, right, still, *nothing)
+
+    def _run(self, stages: Stages, *given: NDArray[np.generic]) -> tuple[Plane, Plane, State]:
         # Of any type: what one stage hands the next is the exporter's own business.
         tensors: dict[str, Any] = dict(zip(self.card.input_names, given, strict=True))
 
@@ -179,7 +194,7 @@ class OnnxNetwork(SteppedNetwork):
             names = [entry.name for entry in session.get_outputs()]
             return [*zip(names, session.run(names, feed), strict=True)]
 
-        for stage in self.card.graphs[iterations]:
+        for stage in stages:
             tensors |= chain(*[*self._beside.map(outputs_of, stage)])
         disparity, sigma, *following = (tensors[name] for name in self.card.output_names)
         return disparity, sigma, tuple(following)

@@ -6,7 +6,8 @@ same weights, so those go into one file beside them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
 
@@ -17,46 +18,112 @@ T = TypeVar("T")
 SMALL_BYTES = 1024  # such tensors stay in the graph: shapes and scalars that runtimes fold
 ALIGNMENT = 4096  # runtimes map whole pages
 TAKES_PLACE = "to_"
+PLAIN = "plain_"  # before what was found by a look that was not the last
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Kind:
+    """Of a whole step; as words, part of a file's name."""
+
+    iterations: int
+    closer: int = 0  # of the iterations, the last ones, in cold steps alone
+
+    def __str__(self) -> str:
+        return f"{self.iterations}_cold" if self.closer else str(self.iterations)
+
+
+class CloserLook(NamedTuple, Generic[T]):
+    """What it takes to go on at another size, and to come back.
+
+    ``enter`` takes the images and what ``end`` gave, and gives what ``begin`` takes, a state too.
+    That state has not moved: an iteration starts from it by the names in ``moved``. ``join`` takes
+    what ``end`` gave at first, as plain_NAME, and again.
+    """
+
+    enter: T
+    moved: Mapping[str, str]
+    join: T
 
 
 class Parts(NamedTuple, Generic[T]):
     """What is found before the iterations, by graphs that do not need each other; one; the rest.
 
-    Outputs are found by name. One of ``iterate`` that is called to_NAME takes the place of NAME.
+    Outputs are found by name. One that is called to_NAME takes the place of NAME.
     """
 
     begin: tuple[T, ...]
     iterate: T
     end: T
+    closer: CloserLook[T] | None = None
 
 
-def stitched(parts: Parts[ModelProto], iterations: int) -> ModelProto:
-    """One graph: inputs of ``begin``, outputs of ``end``, and ``iterations`` times between."""
-    model = ModelProto()
-    model.CopyFrom(parts.begin[0])
-    graph = model.graph
-    for field in (graph.node, graph.initializer, graph.output):
-        del field[:]
-    known: dict[str, str] = {entry.name: entry.name for entry in graph.input}
-    steps = [(f"begin_{number}", part, 0) for number, part in enumerate(parts.begin)]
-    steps += [("iterate", parts.iterate, number) for number in range(iterations)]
-    steps += [("end", parts.end, 0)]
-    for name, part, number in steps:
-        # Weights are named after their part, what is computed after the place it is computed at.
-        place = f"{name}_{number}" if part is parts.iterate else name
-        names = {entry.name: known[entry.name] for entry in part.graph.input}
+def stitched(parts: Parts[ModelProto], kind: Kind) -> ModelProto:
+    """One graph: inputs of ``begin``, outputs of ``end``, and the iterations between.
+
+    What is computed anew for a closer look and not needed stays in; runtimes leave it out.
+    """
+    line = _Line(parts.begin[0])
+    line.begin(parts)
+    line.iterate(parts, range(kind.iterations - kind.closer))
+    if kind.closer:
+        assert parts.closer is not None
+        plain = line.add("end", parts.end, place="plain_end")
+        line.known |= {PLAIN + name: result for name, result in plain.items()}
+        larger = line.add("enter", parts.closer.enter)
+        line.begin(parts, place="closer_")
+        line.known |= {name: larger[given] for given, name in parts.closer.moved.items()}
+        line.iterate(parts, range(kind.iterations - kind.closer, kind.iterations))
+        line.add("end", parts.end, place="closer_end")
+        line.add("join", parts.closer.join, last=True)
+    else:
+        line.add("end", parts.end, last=True)
+    line.model.graph.output.extend(parts.end.graph.output)
+    return line.model
+
+
+class _Line:
+    """A graph that grows at its end."""
+
+    def __init__(self, first: ModelProto) -> None:
+        """With the inputs of ``first``."""
+        self.model = ModelProto()
+        self.model.CopyFrom(first)
+        self._graph = self.model.graph
+        for field in (self._graph.node, self._graph.initializer, self._graph.output):
+            del field[:]
+        self.known = {entry.name: entry.name for entry in self._graph.input}
+        self._weights: set[str] = set()
+
+    def begin(self, parts: Parts[ModelProto], *, place: str = "") -> None:
+        for number, part in enumerate(parts.begin):
+            self.add(f"begin_{number}", part, place=f"{place}begin_{number}")
+
+    def iterate(self, parts: Parts[ModelProto], numbers: Iterable[int]) -> None:
+        for number in numbers:
+            self.add("iterate", parts.iterate, place=f"iterate_{number}")
+
+    def add(
+        self, name: str, part: ModelProto, *, place: str = "", last: bool = False
+    ) -> dict[str, str]:
+        """Put a part at the end: its results by name. Those of the last keep their names.
+
+        Weights are named after their part, what is computed after the place it is computed at.
+        """
+        place = place or name
+        outputs = {entry.name: entry.name.removeprefix(TAKES_PLACE) for entry in part.graph.output}
+        names = {entry.name: self.known[entry.name] for entry in part.graph.input}
         names |= {entry.name: f"{name}.{entry.name}" for entry in part.graph.initializer}
         for node in part.graph.node:
             names |= {result: f"{place}.{result}" for result in node.output if result}
-        if part is parts.end:
-            names |= {entry.name: entry.name for entry in part.graph.output}
-        graph.node.extend(renamed(node, names, place) for node in part.graph.node)
-        if number == 0:
-            graph.initializer.extend(relabelled(entry, names) for entry in part.graph.initializer)
-        results = [entry.name for entry in part.graph.output]
-        known |= {result.removeprefix(TAKES_PLACE): names[result] for result in results}
-    graph.output.extend(parts.end.graph.output)
-    return model
+        names |= outputs if last else {}
+        self._graph.node.extend(renamed(node, names, place) for node in part.graph.node)
+        if name not in self._weights:
+            self._weights.add(name)
+            weights = (relabelled(entry, names) for entry in part.graph.initializer)
+            self._graph.initializer.extend(weights)
+        results = {known: names[output] for output, known in outputs.items()}
+        self.known |= results
+        return results
 
 
 def renamed(node: NodeProto, names: Mapping[str, str], label: str) -> NodeProto:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
+from vergence_models.config import load_config
 from vergence_models.runs import Run
 from vergence_models.stepping import Image, Plane, State, SteppedNetwork
 from vergence_models.tiers import trained_network
@@ -18,6 +20,7 @@ class TorchNetwork(SteppedNetwork):
     def __init__(self, run: Run, *, threads: int = 2) -> None:
         torch.set_num_threads(threads)
         self._network = trained_network(run)
+        self._closer = load_config(run.config_name).closer
         self.card = ModelCard(
             name=run.config_name,
             stride=run.network.stride,
@@ -36,7 +39,7 @@ class TorchNetwork(SteppedNetwork):
         state: State,
         iterations: int,
     ) -> tuple[Plane, Plane, State]:
-        images = (torch.from_numpy(np.ascontiguousarray(image)) for image in (left, right))
+        images = as_tensors(left, right)
         tensors = tuple(torch.from_numpy(array) for array in state)
         estimate, following = self._network(
             *images, torch.from_numpy(uvd_curr_from_prev), tensors, iterations
@@ -46,3 +49,18 @@ class TorchNetwork(SteppedNetwork):
             estimate.sigma.numpy(),
             tuple(tensor.numpy() for tensor in following),
         )
+
+    @torch.inference_mode()
+    def start(self, left: Image, right: Image, iterations: int) -> tuple[Plane, Plane, State]:
+        found = self._network.cold_step(
+            *as_tensors(left, right), iterations, closer=self._closer.get(iterations, 0)
+        )
+        state = tuple(tensor.numpy() for tensor in found.state)
+        return found.disparity.numpy(), found.sigma.numpy(), state
+
+
+def as_tensors(left: Image, right: Image) -> tuple[Tensor, Tensor]:
+    return (
+        torch.from_numpy(np.ascontiguousarray(left)),
+        torch.from_numpy(np.ascontiguousarray(right)),
+    )

@@ -5,7 +5,8 @@ step of the recurrence, for a batch of streams, runs the graphs of its iteration
 The graphs of a stage do not need each other and may run side by side; each takes, by name, what
 the caller gives or what a graph of an earlier stage gave. Any graph may give an output of the
 model, and no two graphs of a count give the same name. Most models have a single graph per count:
-one stage of one graph.
+one stage of one graph. A model may start a stream in another way than it goes on: cold graphs take
+the place of the others where there is no state, at the counts that they are there for.
 
 Inputs:
 
@@ -27,7 +28,8 @@ the two principal points differ: the transform carries that difference.
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +83,12 @@ class ModelCard:
     state: tuple[StateTensor, ...]
     graphs: Mapping[int, Stages]  # by iterations
     weights_sha256: str  # of all files together: the identity told to clients
+    cold_graphs: Mapping[int, Stages] = field(default_factory=dict)  # by iterations; may be none
+
+    def stages(self, iterations: int, *, cold: bool) -> Stages:
+        """The graphs of a step, of a stream's first one if ``cold``. KeyError: no such count."""
+        usual = self.graphs[iterations]
+        return self.cold_graphs.get(iterations, usual) if cold else usual
 
     @property
     def input_names(self) -> tuple[str, ...]:
@@ -142,16 +150,20 @@ def load_model_card(weights_dir: Path, name: str) -> ModelCard:
     # The graphs, and what large networks keep beside them because their graphs have it in common.
     files = entry["files"]
     digests = [_checked_digest(weights_dir / file, files[file]) for file in sorted(files)]
-    graphs = {
-        int(count): tuple(tuple(weights_dir / file for file in stage) for stage in stages)
-        for count, stages in entry["graphs"].items()
-    }
-    for graph in (graph for stages in graphs.values() for stage in stages for graph in stage):
-        if graph.name not in files:
-            raise ManifestError(
-                f"{path}: model {name!r} runs {graph.name}, which is not among its files; "
-                "export the model anew"
-            )
+    graphs, cold_graphs = (
+        {
+            int(count): tuple(tuple(weights_dir / file for file in stage) for stage in stages)
+            for count, stages in entry.get(kind, {}).items()
+        }
+        for kind in ("graphs", "cold_graphs")
+    )
+    for stages in (*graphs.values(), *cold_graphs.values()):
+        for graph in chain(*stages):
+            if graph.name not in files:
+                raise ManifestError(
+                    f"{path}: model {name!r} runs {graph.name}, which is not among its files; "
+                    "export the model anew"
+                )
     return ModelCard(
         name=name,
         stride=entry["stride"],
@@ -159,6 +171,7 @@ def load_model_card(weights_dir: Path, name: str) -> ModelCard:
         state=tuple(StateTensor(**tensor) for tensor in entry["state"]),
         graphs=graphs,
         weights_sha256=hashlib.sha256(b"".join(digests)).hexdigest(),
+        cold_graphs=cold_graphs,
     )
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from prometheus_client import CollectorRegistry
 
+from vergence_proto.types import Delivery
 from vergence_service.batcher import StepBatcher
 from vergence_service.continuity import ContinuityLimits
 from vergence_service.engine import DepthEngine
@@ -78,7 +79,10 @@ async def running(
         batcher,
         card=model.card,
         iterations=settings.model.iterations,
-        cold_iterations=settings.model.cold_iterations,
+        cold_iterations={
+            Delivery.NEWEST: settings.model.cold_iterations,
+            Delivery.EVERY: settings.model.cold_iterations_every,
+        },
         limits=ContinuityLimits(**settings.continuity.model_dump()),
         max_pixels=settings.streams.max_pixels,
         clock=clock,

@@ -43,7 +43,7 @@ class _Waiting:
     @property
     def shape_of_work(self) -> tuple[object, ...]:
         """Rows can share a batch if this is equal."""
-        return self.live, self.step.view.left.shape, self.step.iterations
+        return self.live, self.step.view.left.shape, self.step.iterations, self.step.cold
 
     @property
     def live(self) -> bool:
@@ -92,10 +92,10 @@ class StepBatcher:
         for item in _wanted([*self._in_model, *self._waiting]):
             item.answer.set_exception(Draining("the server stopped before it took the frame"))
 
-    async def warm_up(self, iterations: Sequence[int]) -> None:
+    async def warm_up(self, iterations: int, *cold_iterations: int) -> None:
         """Load the model, in a thread that will run it."""
         loop = asyncio.get_running_loop()
-        await loop.run_in_executor(self._threads, self._model.warm_up, iterations)
+        await loop.run_in_executor(self._threads, self._model.warm_up, iterations, *cold_iterations)
 
     async def step(
         self, step: Step, *, deadline_s: float | None = None, live_stream: str | None = None

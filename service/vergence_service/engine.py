@@ -1,7 +1,7 @@
 """The use case: open a stream, step it frame by frame, close it."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from enum import Enum
 
 from vergence_proto.errors import (
@@ -48,7 +48,7 @@ class DepthEngine:
         *,
         card: ModelCard,
         iterations: int,
-        cold_iterations: int,
+        cold_iterations: Mapping[Delivery, int],
         limits: ContinuityLimits,
         max_pixels: int,
         clock: Callable[[], float],
@@ -72,8 +72,8 @@ class DepthEngine:
 
     async def start(self) -> None:
         """Load the model; until it is done every opening is refused with NotReady."""
-        counts = {self._iterations, self._cold_iterations}
-        await self._batcher.warm_up(sorted(map(self.card.iterations_at_most, counts)))
+        counts = (self._iterations, *self._cold_iterations.values())
+        await self._batcher.warm_up(*map(self.card.iterations_at_most, counts))
         self._phase = _Phase.SERVING
 
     def drain(self, *, within_s: float) -> None:
@@ -272,7 +272,7 @@ class DepthEngine:
 
     def _iterations_of(self, opening: Opening, *, cold: bool) -> int:
         wanted = (
-            opening.cold_iterations or self._cold_iterations
+            opening.cold_iterations or self._cold_iterations[opening.delivery]
             if cold
             else opening.iterations or self._iterations
         )

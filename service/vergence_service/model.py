@@ -82,6 +82,10 @@ class Step:
     iterations: int  # one of the model card's
 
     @property
+    def cold(self) -> bool:
+        return self.state is None
+
+    @property
     def uvd_curr_from_prev(self) -> NDArray[np.float32]:
         """How the camera's motion moves pixels and disparities: [4, 4].
 
@@ -122,12 +126,12 @@ class StereoModel(Protocol):
         """How many threads may call ``step`` at once; above 1, a batch of several gains nothing."""
         ...
 
-    def warm_up(self, iterations: Sequence[int]) -> None:
-        """Do now what the first steps would otherwise wait for."""
+    def warm_up(self, iterations: int, *cold_iterations: int) -> None:
+        """Do now what the first steps of such counts would otherwise wait for."""
         ...
 
     def step(self, steps: Sequence[Step]) -> list[StepResult]:
-        """Take one step of each stream; all have one image size and one iteration count.
+        """One step of each stream, all of one image size and iteration count, all cold or none.
 
         Raises NonFinite if any row's result is not finite.
         """
@@ -175,9 +179,10 @@ class OnnxStereoModel:
     def lanes(self) -> int:
         return self._graphs.lanes if self._device is None else 1
 
-    def warm_up(self, iterations: Sequence[int]) -> None:
-        for count in iterations:
-            self._graphs.load(count)
+    def warm_up(self, iterations: int, *cold_iterations: int) -> None:
+        self._graphs.load(iterations, cold=False)
+        for count in cold_iterations:
+            self._graphs.load(count, cold=True)
 
     def close(self) -> None:
         """End the threads that steps use; none may follow."""
@@ -192,7 +197,7 @@ class OnnxStereoModel:
 
     def _step(self, steps: Sequence[Step]) -> list[StepResult]:
         height, width = steps[0].view.left.shape[:2]
-        found = self._graphs.run(steps[0].iterations, self._feeds(steps))
+        found = self._graphs.run(steps[0].iterations, self._feeds(steps), cold=steps[0].cold)
         # What is not finite in a state that stays shows in the maps of the next step.
         to_check = [values for values in found.values() if not isinstance(values, Resident)]
         if not all(np.isfinite(values).all() for values in to_check):

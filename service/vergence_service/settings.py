@@ -89,7 +89,10 @@ class ModelSettings(_Section):
     threads: int = Field(default=0, ge=0, description="of all steps; 0: one a core")
     allow_spinning: bool = Field(default=False, description="quicker steps, for all of a core")
     iterations: PositiveInt = Field(default=1, description="of a warm step")
-    cold_iterations: PositiveInt = Field(default=5, description="of a cold start, at most")
+    cold_iterations: PositiveInt = Field(default=5, description="of a live cold start, at most")
+    cold_iterations_every: PositiveInt = Field(
+        default=8, description="the same of a stream that wants every frame: no frame is in a hurry"
+    )
     max_batch: PositiveInt = Field(
         default=1, description="streams stepped together on a GPU; a CPU steps each by itself"
     )

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from onnxruntime import InferenceSession, SessionOptions
 
-from vergence_proto.model_io import DISPARITY, SIGMA, ManifestError, ModelCard
+from vergence_proto.model_io import DISPARITY, SIGMA, ManifestError, ModelCard, Stages
 from vergence_service.providers import Resident, Tensor, run_on_device, start_session
 
 log = logging.getLogger(__name__)
@@ -78,8 +78,9 @@ class StagedGraphs:
         self._allow_spinning = allow_spinning
         self._device = device
         self._sessions: dict[Path, InferenceSession] = {}
-        self._steps: dict[int, list[list[_Part]]] = {}
-        width = max(len(stage) for stages in card.graphs.values() for stage in stages)
+        self._steps: dict[Stages, list[list[_Part]]] = {}
+        steps = (*card.graphs.values(), *card.cold_graphs.values())
+        width = max(len(stage) for stages in steps for stage in stages)
         self.lanes = min(threads or _cores(), width)
         # A model that is cut for several threads leaves each of them its own graph, also in stages
         # of one: two threads that shared the last graph of `lite`, operator by operator, took 15 %
@@ -95,15 +96,20 @@ class StagedGraphs:
         """End the threads; no step may follow."""
         self._beside.shutdown()
 
-    def load(self, iterations: int) -> None:
-        """Raises ManifestError, the graphs do not fit together, and ProviderUnavailable."""
-        with self._loading:
-            if iterations not in self._steps:
-                self._steps[iterations] = self._loaded(iterations)
-                log.info("loaded %s, %d iterations", self._card.name, iterations)
+    def load(self, iterations: int, *, cold: bool) -> list[list[_Part]]:
+        """The graphs of a step, from now on in memory.
 
-    def _loaded(self, iterations: int) -> list[list[_Part]]:
-        stages = [[*map(self._session, stage)] for stage in self._card.graphs[iterations]]
+        Raises ManifestError, the graphs do not fit together, and ProviderUnavailable.
+        """
+        step = self._card.stages(iterations, cold=cold)
+        with self._loading:
+            if step not in self._steps:
+                self._steps[step] = self._loaded(iterations, step)
+                log.info("loaded %s, %d iterations", self._card.name, iterations)
+            return self._steps[step]
+
+    def _loaded(self, iterations: int, step: Stages) -> list[list[_Part]]:
+        stages = [[*map(self._session, stage)] for stage in step]
         _require_fit(self._card, iterations, stages)
         needed = set(self._card.output_names)
         parts: list[list[_Part]] = []
@@ -112,12 +118,12 @@ class StagedGraphs:
             needed.update(name for part in parts[0] for name in part.inputs)
         return parts
 
-    def run(self, iterations: int, given: Tensors) -> dict[str, Tensor]:
+    def run(self, iterations: int, given: Tensors, *, cold: bool) -> dict[str, Tensor]:
         """One step of a batch: the card's inputs to the card's outputs, by name."""
-        self.load(iterations)
+        stages = self.load(iterations, cold=cold)
         found: dict[str, Tensor] = {}
         with self._counted():
-            for parts in self._steps[iterations]:
+            for parts in stages:
                 for outputs in self._run_stage(parts, {**given, **found}):
                     found |= outputs
         return {name: found[name] for name in self._card.output_names}

@@ -60,7 +60,7 @@ class BareLoop:
         self._model = OnnxStereoModel(
             packaged_weights_dir(), "lite", providers=["cpu"], threads=threads, allow_spinning=False
         )
-        self._model.warm_up(sorted({self._iterations(None), 1}))
+        self._model.warm_up(1, self._iterations(None))
 
     def fps(self, frames: StereoSource | list[SourceFrame]) -> float:
         state: RecurrentState | None = None

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from vergence_models.config import RaftNetworkConfig, load_config
 from vergence_models.export import exported_parts
 from vergence_models.raft.network import RaftNetwork
-from vergence_models.stitch import TAKES_PLACE, Parts, stitched, write_with_shared_weights
+from vergence_models.stitch import TAKES_PLACE, Kind, Parts, stitched, write_with_shared_weights
 from vergence_proto.model_io import LEFT, RIGHT, UVD_CURR_FROM_PREV
 
 HEIGHT, WIDTH = 480, 640
@@ -75,7 +75,7 @@ def main() -> None:
     with TemporaryDirectory() as folder:
         out = Path(folder)
         paths = {count: out / f"step_{count}.onnx" for count in COUNTS}
-        models = {path: stitched(parts, count) for count, path in paths.items()}
+        models = {path: stitched(parts, Kind(count)) for count, path in paths.items()}
         whole = sum(model.ByteSize() for model in models.values())
         write_with_shared_weights(models, out / "weights")
         shared = sum(path.stat().st_size for path in (*paths.values(), out / "weights"))

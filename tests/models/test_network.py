@@ -17,12 +17,19 @@ from torch import nn
 from tests.models.trained import as_trained
 from vergence_models.config import Config, LiteNetworkConfig
 from vergence_models.evaluate import WEIGHTS
-from vergence_models.export import PARITY_PX, check_parity, export_run, shifted_pair
+from vergence_models.export import (
+    PARITY_PX,
+    check_cold_parity,
+    check_parity,
+    export_run,
+    shifted_pair,
+)
 from vergence_models.graphs import COLUMNS, Part, export_part
 from vergence_models.layers import all_pairs, banded, best_rival
 from vergence_models.lite.network import LiteNetwork, LiteState
 from vergence_models.runs import Run
 from vergence_models.stepping import OnnxNetwork
+from vergence_models.stitch import Kind
 
 HEIGHT, WIDTH = 192, 256
 
@@ -64,13 +71,15 @@ def test_the_graph_equals_pytorch_frame_by_frame(
     # Under pytest's capture the tracer would format every symbolic shape it meets: minutes of it.
     monkeypatch.setattr(logging.getLogger("torch.__trace"), "propagate", False)
     run = Run("lite", network.config, network.state_dict(), story={}, measured={})
-    export_run(run, Config("lite", network.config, iterations=(1, 2)), tmp_path)
+    export_run(run, Config("lite", network.config, iterations=(1, 2), closer={2: 1}), tmp_path)
     graphs = OnnxNetwork(tmp_path, "lite")
     for count in (1, 2):
         assert check_parity(network, graphs, count, frames=4) < PARITY_PX
+    assert check_cold_parity(network, graphs, Kind(2, closer=1)) < PARITY_PX
     # Both counts begin with the same two graphs.
     assert graphs.card.graphs[1][0] == graphs.card.graphs[2][0]
     assert len(graphs.card.graphs[1][0]) == 2
+    assert graphs.card.cold_graphs[2] != graphs.card.graphs[2]
 
 
 def test_a_second_iteration_is_a_second_look_at_the_same_frame(network: LiteNetwork) -> None:

@@ -18,12 +18,15 @@ from vergence_models.calibrate import (
     MAX_LOSS,
     RANGE_CLIPS,
     QuantizationError,
-    find_scales,
     make_int8,
+    scales_of,
+    steps,
 )
+from vergence_models.data.clips import StereoClips
 from vergence_models.data.pool import ClipPool, write_shard
-from vergence_models.quantization_plan import plan
+from vergence_models.quantization_plan import Plan, plan
 from vergence_models.quantize import Scale, quantized, with_weights_apart
+from vergence_models.stitch import Kind
 from vergence_proto.model_io import StateTensor
 
 STATES = (StateTensor("disparity", 1, 4),)
@@ -113,6 +116,10 @@ def answer_of(model: ModelProto) -> NDArray[np.float32]:
     return disparity
 
 
+def found_scales(model: ModelProto, what: Plan, clips: StereoClips) -> dict[str, Scale]:
+    return scales_of(steps(model, STATES, clips, what.measured), what.measured)
+
+
 @pytest.fixture
 def pool(tmp_path: Path) -> ClipPool:
     write_shard(tmp_path / "pool" / "shard_1_000000", wall_clips(RANGE_CLIPS + 2))
@@ -122,7 +129,7 @@ def pool(tmp_path: Path) -> ClipPool:
 def test_an_int8_graph_answers_nearly_the_same() -> None:
     model = wall_model()
     what = plan(model)
-    scales = find_scales(model, what.measured, STATES, wall_clips(2))
+    scales = found_scales(model, what, wall_clips(2))
     expected, got = answer_of(model), answer_of(quantized(model, what, scales))
     step = float(scales["next_disparity"].step)
     assert np.abs(expected - expected.mean()).max() > 5 * step  # there is something to lose
@@ -133,7 +140,7 @@ def test_convolutions_of_features_become_bytes_and_images_stay() -> None:
     model = wall_model()
     what = plan(model)
     assert what.convolutions == {"a", "b", "next_disparity"}
-    scales = find_scales(model, what.measured, STATES, wall_clips(1))
+    scales = found_scales(model, what, wall_clips(1))
     graph = quantized(model, what, scales).graph
     weights = {tensor.name: tensor.data_type for tensor in graph.initializer}
     for result in what.convolutions:
@@ -176,7 +183,7 @@ def with_a_wider_view(model: ModelProto) -> ModelProto:
 def test_bytes_are_put_together_and_doubled_as_they_are() -> None:
     model = with_a_wider_view(wall_model())
     what = plan(model)
-    scales = find_scales(model, what.measured, STATES, wall_clips(2))
+    scales = found_scales(model, what, wall_clips(2))
     int8 = quantized(model, what, scales)
     step = float(scales["next_disparity"].step)
     np.testing.assert_allclose(answer_of(int8), answer_of(model), atol=3 * step)
@@ -213,13 +220,13 @@ def test_a_scale_covers_its_range_and_zero_is_exact(low: float, high: float) -> 
 def test_graphs_are_made_and_the_loss_is_told(pool: ClipPool) -> None:
     wall = wall_model()
     before = wall.SerializeToString()
-    models, told = make_int8({1: wall, 2: wall}, STATES, pool, max_disparity_px=192)
+    models, told = make_int8({Kind(1): wall, Kind(2): wall}, STATES, pool, max_disparity_px=192)
     story = cast("dict[str, Any]", told)
     assert story["convolutions"] == 3
     assert story["measured_clips"] == 2
     assert 0 < story["float_epe_px"] < 1
     assert 0 < story["epe_px"] < MAX_LOSS * story["float_epe_px"]
-    assert set(models) == {1, 2}
+    assert set(models) == {Kind(1), Kind(2)}
     for model in models.values():
         operators = {node.op_type for node in model.graph.node}
         assert {"QuantizeLinear", "DequantizeLinear"} <= operators
@@ -228,4 +235,4 @@ def test_graphs_are_made_and_the_loss_is_told(pool: ClipPool) -> None:
 
 def test_what_loses_too_much_is_refused(pool: ClipPool) -> None:
     with pytest.raises(QuantizationError, match="1 iterations: EPE"):
-        make_int8({1: wall_model(outlier=3000.0)}, STATES, pool, max_disparity_px=192)
+        make_int8({Kind(1): wall_model(outlier=3000.0)}, STATES, pool, max_disparity_px=192)

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from onnx import ModelProto, NodeProto, TensorProto, helper, numpy_helper
 
 from vergence_models.stages import StageError, handed_on, in_stages
-from vergence_models.stitch import Parts, stitched
+from vergence_models.stitch import CloserLook, Kind, Parts, stitched
 
 Array = NDArray[Any]
-COUNTS = (1, 3)
+KINDS = (Kind(1), Kind(3), Kind(3, closer=1))
 
 
 def part(
@@ -55,7 +55,45 @@ def parts() -> Parts[ModelProto]:
             0.5,
         ),
         end=part([node("Mul", "at_state weight", "answer")], ["at_state"], ["answer"], 2.0),
+        closer=CloserLook(
+            enter=part(
+                [
+                    node("Add", "left weight", "to_left"),
+                    node("Sub", "right weight", "to_right"),
+                    node("Mul", "answer weight", "to_state"),
+                ],
+                ["left", "right", "answer"],
+                ["to_left", "to_right", "to_state"],
+                11.0,
+            ),
+            moved={"state": "at_state"},
+            join=part(
+                [
+                    node("Sub", "plain_answer answer", "less"),
+                    node("Div", "less weight", "to_answer"),
+                ],
+                ["plain_answer", "answer"],
+                ["to_answer"],
+                13.0,
+            ),
+        ),
     )
+
+
+def computed(kind: Kind, left: Array, right: Array, state: Array) -> Array:
+    """What :func:`parts` say, in numpy."""
+
+    def iterated(left: Array, right: Array, state: Array, count: int) -> Array:
+        for _ in range(count):
+            state = state * np.float32(0.5) + left * np.float32(3) + right / np.float32(7)
+        return state
+
+    plain = 2 * iterated(left, right, -state, kind.iterations - kind.closer)
+    if not kind.closer:
+        return plain
+    again = 2 * iterated(left + 11, right - 11, plain * 11, kind.closer)
+    joined: Array = (plain - again) / np.float32(13)
+    return joined
 
 
 def run(model: ModelProto, tensors: dict[str, Array]) -> dict[str, Array]:
@@ -68,28 +106,26 @@ def run(model: ModelProto, tensors: dict[str, Array]) -> dict[str, Array]:
 
 
 def test_stages_one_after_another_are_the_whole_step() -> None:
-    models = {count: stitched(parts(), count) for count in COUNTS}
+    models = {kind: stitched(parts(), kind) for kind in KINDS}
     stages, files = in_stages("tiny", models, handed_on(parts()))
     assert stages == {
-        count: [["tiny_begin_0.onnx", "tiny_begin_1.onnx"], [f"tiny_{count}.onnx"]]
-        for count in COUNTS
+        kind: [["tiny_begin_0.onnx", "tiny_begin_1.onnx"], [f"tiny_{kind}.onnx"]] for kind in KINDS
     }
     random = np.random.default_rng(0)
     given = {name: random.normal(size=4).astype(np.float32) for name in ("left", "right", "state")}
-    answers = []
-    for count in COUNTS:
+    for kind in KINDS:
         known = dict(given)
-        for stage in stages[count]:
+        for stage in stages[kind]:
             known |= {
                 name: value for file in stage for name, value in run(files[file], known).items()
             }
-        np.testing.assert_array_equal(known["answer"], run(models[count], given)["answer"])
-        answers.append(known["answer"])
-    assert not np.array_equal(answers[0], answers[1])
+        np.testing.assert_array_equal(known["answer"], run(models[kind], given)["answer"])
+        expected = computed(kind, given["left"], given["right"], given["state"])
+        np.testing.assert_allclose(known["answer"], expected, rtol=1e-4, atol=1e-4)
 
 
 def test_a_graph_holds_only_its_own() -> None:
-    models = {count: stitched(parts(), count) for count in COUNTS}
+    models = {kind: stitched(parts(), kind) for kind in KINDS}
     _, files = in_stages("tiny", models, handed_on(parts()))
     kept = {
         name: {tensor.name for tensor in model.graph.initializer} for name, model in files.items()
@@ -97,12 +133,19 @@ def test_a_graph_holds_only_its_own() -> None:
     assert kept["tiny_begin_0.onnx"] == {"begin_0.weight"}
     assert kept["tiny_begin_1.onnx"] == {"begin_1.weight"}
     assert kept["tiny_3.onnx"] == {"iterate.weight", "end.weight"}
+    # A closer look begins anew, and where its state lies is not computed again.
+    closer = {f"closer_begin_{number}.{name}" for number, name in enumerate(("near", "far"))}
+    made = {name for each in files["tiny_3_cold.onnx"].graph.node for name in each.output}
+    assert closer < made
+    assert "closer_begin_0.at_state" not in made
     assert [entry.name for entry in files["tiny_begin_1.onnx"].graph.input] == ["right"]
 
 
 def test_a_beginning_that_depends_on_the_count_is_refused() -> None:
-    models = {count: stitched(parts(), count) for count in COUNTS}
-    (weight,) = (each for each in models[3].graph.initializer if each.name == "begin_1.weight")
+    models = {kind: stitched(parts(), kind) for kind in KINDS}
+    (weight,) = (
+        each for each in models[Kind(3)].graph.initializer if each.name == "begin_1.weight"
+    )
     weight.CopyFrom(numpy_helper.from_array(np.array([8.0], np.float32), "begin_1.weight"))
-    with pytest.raises(StageError, match=r"tiny_begin_1\.onnx: is another with 3 iterations"):
+    with pytest.raises(StageError, match=r"tiny_begin_1\.onnx: is another in tiny_3 than"):
         in_stages("tiny", models, handed_on(parts()))

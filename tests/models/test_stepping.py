@@ -1,9 +1,11 @@
 """Graphs stepped by evaluation and studies."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from tests.support.weights_copy import WEIGHTS
+from tests.support.weights_copy import WEIGHTS, Entry, copied_weights
 from vergence_models.stepping import OnnxNetwork
 
 HEIGHT, WIDTH = 40, 70
@@ -22,3 +24,19 @@ def test_stages_answer_bit_for_bit_what_the_whole_graph_answers(threads: int) ->
         np.testing.assert_array_equal(in_stages, disparity)
         np.testing.assert_array_equal(its_sigma, sigma)
         np.testing.assert_array_equal(once, state)
+
+
+def test_a_start_runs_the_cold_graphs(tmp_path: Path) -> None:
+    def start_otherwise(entry: Entry) -> None:
+        entry["cold_graphs"] = {"1": entry["graphs"]["2"]}
+
+    network = OnnxNetwork(copied_weights(tmp_path, edit=start_otherwise), "staged")
+    left, right = np.random.default_rng(2).integers(0, 255, (2, 1, HEIGHT, WIDTH, 3), np.uint8)
+    still, nothing = np.eye(4, dtype=np.float32)[None], network.cold_state(HEIGHT, WIDTH)
+    started, once, twice = (
+        network.start(left, right, 1),
+        network.run(left, right, still, nothing, 1),
+        network.run(left, right, still, nothing, 2),
+    )
+    np.testing.assert_array_equal(started[0], twice[0])
+    assert not np.array_equal(started[0], once[0])

@@ -60,6 +60,18 @@ def test_a_missing_file_is_refused(tmp_path: Path) -> None:
         load_model_card(weights, "staged")
 
 
+def test_a_first_step_has_graphs_of_its_own_where_there_are_any(tmp_path: Path) -> None:
+    def start_otherwise(entry: Entry) -> None:
+        entry["cold_graphs"] = {"1": [["left.onnx", "right.onnx"], ["staged_2.onnx"]]}
+
+    weights = copied_weights(tmp_path, edit=start_otherwise)
+    card = load_model_card(weights, "staged")
+    cold, warm = (card.stages(1, cold=cold) for cold in (True, False))
+    assert cold[-1] == (weights / "staged_2.onnx",)
+    assert warm[-1] == (weights / "staged_1.onnx",)
+    assert card.stages(2, cold=True) == card.stages(2, cold=False)
+
+
 def leave_out(entry: Entry) -> None:
     del entry["files"]["right.onnx"]
 
@@ -68,7 +80,14 @@ def rename(entry: Entry) -> None:
     entry["graphs"]["2"][0][1] = "right_2.onnx"
 
 
-@pytest.mark.parametrize(("edit", "file"), [(leave_out, "right.onnx"), (rename, "right_2.onnx")])
+def start_with_another(entry: Entry) -> None:
+    entry["cold_graphs"] = {"2": [["staged_9.onnx"]]}
+
+
+@pytest.mark.parametrize(
+    ("edit", "file"),
+    [(leave_out, "right.onnx"), (rename, "right_2.onnx"), (start_with_another, "staged_9.onnx")],
+)
 def test_a_graph_without_a_digest_is_refused(
     tmp_path: Path, edit: Callable[[Entry], None], file: str
 ) -> None:

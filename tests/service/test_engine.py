@@ -22,7 +22,7 @@ from vergence_proto.errors import (
     UnknownStream,
 )
 from vergence_proto.geometry import Axes, Pose
-from vergence_proto.types import DisparityMap, Origin, PoseSample, StereoFrame, StereoRig
+from vergence_proto.types import Delivery, DisparityMap, Origin, PoseSample, StereoFrame, StereoRig
 from vergence_service.batcher import StepBatcher
 from vergence_service.continuity import ContinuityLimits
 from vergence_service.engine import DepthEngine
@@ -262,6 +262,20 @@ async def test_disparity_is_stated_relative_to_the_principal_points() -> None:
         np.testing.assert_array_equal(answer.disparity_px, expected)
 
 
+@pytest.mark.parametrize(
+    ("delivery", "asked", "cold"),
+    [(Delivery.NEWEST, 0, 1), (Delivery.EVERY, 0, 4), (Delivery.NEWEST, 4, 4)],
+)
+async def test_who_waits_for_every_frame_gets_a_first_one_with_more_iterations(
+    delivery: Delivery, asked: int, cold: int
+) -> None:
+    opening = Opening(StereoRig.from_rectified(RIG), delivery=delivery, cold_iterations=asked)
+    async with running_server(RecallModel(), model__cold_iterations=3) as server:
+        await server.engine.open("a", opening)
+        answers = [await step(server.engine, "a", make_frame(i)) for i in (1, 2)]
+    assert [answer.iterations for answer in answers] == [cold, 1]
+
+
 async def test_before_the_model_is_loaded_every_opening_is_refused() -> None:
     model, metrics = RecallModel(), Metrics(CollectorRegistry())
     clock = ManualClock()
@@ -281,7 +295,7 @@ async def test_before_the_model_is_loaded_every_opening_is_refused() -> None:
             batcher,
             card=model.card,
             iterations=1,
-            cold_iterations=4,
+            cold_iterations=dict.fromkeys(Delivery, 4),
             limits=ContinuityLimits(max_gap_s=1, max_jump_m=1, max_jump_deg=45),
             max_pixels=RIG.width * RIG.height,
             clock=clock,

@@ -159,12 +159,29 @@ def test_a_batch_of_staged_steps_gives_each_stream_its_own() -> None:
             assert_same(model.step([step])[0], together)
 
 
+def test_a_stream_starts_with_cold_graphs_and_goes_on_with_the_others(tmp_path: Path) -> None:
+    def start_otherwise(entry: Entry) -> None:
+        entry["cold_graphs"] = {"1": entry["graphs"]["2"]}
+
+    with opened("staged") as model:
+        [first] = model.step([Step(make_view(1), None, 2)])
+        [second] = model.step([Step(make_view(2), first.state, 1)])
+    with opened("staged", weights=copied_weights(tmp_path, edit=start_otherwise)) as model:
+        model.warm_up(1, 1)
+        [begun] = model.step([Step(make_view(1), None, 1)])
+        [gone_on] = model.step([Step(make_view(2), begun.state, 1)])
+        [without] = model.step([Step(make_view(1), None, 2)])  # there is none for that count
+    assert_same(begun, first)
+    assert_same(gone_on, second)
+    assert_same(without, first)
+
+
 def test_a_graph_that_several_counts_share_is_loaded_once(tmp_path: Path) -> None:
     weights = copied_weights(tmp_path)
     with opened("staged") as model:
         expected = walk(model)
     with opened("staged", weights=weights) as model:
-        model.warm_up([1])
+        model.warm_up(1, 1)
         for shared in ("left.onnx", "right.onnx"):
             (weights / shared).unlink()
         for one, other in zip(expected, walk(model), strict=True):
@@ -238,6 +255,6 @@ def test_graphs_that_do_not_fit_together_are_refused_when_they_are_loaded(
         change(entry["graphs"])
 
     with opened("staged", weights=copied_weights(tmp_path, edit=edit)) as model:
-        model.warm_up([2])
+        model.warm_up(2, 2)
         with pytest.raises(ManifestError, match=f"staged, 1 iterations: {says}"):
-            model.warm_up([1])
+            model.warm_up(1, 1)

@@ -37,10 +37,11 @@ class RecallModel:
         self._free.set()
         self._entered = threading.Semaphore(0)
 
-    def warm_up(self, iterations: Sequence[int]) -> None:
-        assert set(iterations) <= set(self.card.graphs)
+    def warm_up(self, iterations: int, *cold_iterations: int) -> None:
+        assert {iterations, *cold_iterations} <= set(self.card.graphs)
 
     def step(self, steps: Sequence[Step]) -> list[StepResult]:
+        assert len({(row.iterations, row.cold, row.view.left.shape) for row in steps}) == 1
         self.batches.append(len(steps))
         self._entered.release()
         assert self._free.wait(timeout=30)

@@ -29,8 +29,6 @@ from vergence_proto.accuracy import Accuracy
 from vergence_proto.layouts import LayoutError, StereoSource, read_ahead, write_disparity_png
 from vergence_proto.types import Delivery
 
-# Of a lone pair: there is no frame before it to build on.
-_PAIR_ITERATIONS = 8
 # Files being written while the next frames are stepped.
 _UNWRITTEN = 4
 
@@ -59,7 +57,7 @@ async def run(
             source.rig,
             delivery=Delivery.EVERY if rate_hz is None else Delivery.NEWEST,
             iterations=iterations,
-            cold_iterations=(iterations or _PAIR_ITERATIONS) if alone else 0,
+            cold_iterations=iterations if alone else 0,
         ) as session,
     ):
         title = title_of(source, session.model.name)

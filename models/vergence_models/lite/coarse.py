@@ -25,12 +25,9 @@ from vergence_models.warp import cell_centres
 BIN_PX = 4  # spacing of the coarse disparities
 REACH = 2  # entries looked up on either side of the current disparity
 TAPS = 2 * REACH + 1
-PEAKS = 2  # of the scores
-AROUND = 5  # what surroundings suggest: the smooth, farthest, nearest surface, the current rims
-HYPOTHESES = 1 + PEAKS + AROUND  # with the current disparity
-CELL_INPUTS = TAPS + 2 * (PEAKS + AROUND) + 3  # what the cell sees besides the context
-CELL = 72  # channels of the cell: its state, what it sees, and the context in what is left
-PEAK_APART = 4  # bins between the best of the scores and the second
+FILLS = 3  # surfaces that the surroundings suggest: the smooth, the farthest, the nearest one
+HYPOTHESES = 2 + FILLS  # with the current disparity and the best of the scores
+CELL_INPUTS = TAPS + 2 * FILLS + 5  # what the cell sees besides the context
 MIN_PX = 0.1  # no answer is nearer to infinity
 
 
@@ -101,28 +98,19 @@ def coarse_position(d: Tensor, last: int) -> Tensor:
     return last - d * (1 / BIN_PX)
 
 
-def peaks(volume: Volume) -> tuple[Tensor, Tensor]:
-    """The best window of five bins and the best one apart from it: px and log-probability.
-
-    Each [B, 2, H, W]. A thin thing in front of a pattern is often the second.
-    """
+def peak(volume: Volume) -> tuple[Tensor, Tensor]:
+    """Disparity px and log-probability of the best window of five bins, each [B, 1, H, W]."""
     scores = volume.scores
-    last = scores.shape[-1] - 1
-    best = scores.argmax(dim=-1, keepdim=True).to(scores.dtype)
-    # Few cheap operations: a parabola is far below the scores where bins are near, above elsewhere.
-    steps = torch.arange(last + 1, device=scores.device).to(scores.dtype) * 100 - best * 100
-    apart = steps * steps - 1e4 * (PEAK_APART - 0.5) ** 2
-    second = torch.minimum(scores, apart).argmax(dim=-1, keepdim=True).to(scores.dtype)
-    at = torch.cat((best, second), dim=-1).permute(0, 3, 1, 2).clamp(2, last - 2)
-    offsets = torch.arange(-2, 3, device=scores.device).to(scores.dtype)
-    entries = at[:, :, None] + offsets[:, None, None]
-    window = gathered(volume, entries.flatten(1, 2)).view(entries.shape)
-    top = scores.amax(dim=-1)[:, None]
-    weights = torch.exp(window - top[:, None])
-    mass = weights.sum(dim=2)
+    bins = scores.shape[-1]
+    best = scores.argmax(dim=-1)[:, None].clamp(2, bins - 3).to(scores.dtype)
+    offsets = torch.arange(-2, 3, device=scores.device).to(scores.dtype)[:, None, None]
+    window = gathered(volume, best + offsets)
+    top = window.amax(dim=1, keepdim=True)
+    weights = torch.exp(window - top)
+    mass = weights.sum(dim=1, keepdim=True)
     total = torch.exp(scores - top[:, 0, :, :, None]).sum(dim=-1)[:, None]
-    centre = (weights * offsets[:, None, None]).sum(dim=2) / (mass + 1e-12)
-    return (last - at - centre) * BIN_PX, torch.log((mass / total).clamp(min=1e-6))
+    centre = (weights * offsets).sum(dim=1, keepdim=True) / mass
+    return (bins - 1 - best - centre) * BIN_PX, torch.log(mass / total)
 
 
 def smooth_fill(d: Tensor, confidence: Tensor) -> Tensor:
@@ -166,17 +154,12 @@ def beyond(d: Tensor, *, scale: int) -> Tensor:
     return ((d - u) * (1 / scale)).clamp(-1, 1)
 
 
-def rims(d: Tensor) -> Tensor:
-    """The largest and the smallest disparity of 3x3 cells: [B, 1, H, W] to [B, 2, H, W]."""
-    return torch.cat((F.max_pool2d(d, 3, 1, 1), -F.max_pool2d(-d, 3, 1, 1)), dim=1)
-
-
 class CoarseUpdate(nn.Module):
     """One iteration at 1/8: look at the scores round the current disparity, choose, correct."""
 
     def __init__(self, config: LiteNetworkConfig) -> None:
         super().__init__()
-        self.cell = GatedCell(config.hidden, CELL - config.hidden, kernel=1)
+        self.cell = GatedCell(config.hidden, 64 - config.hidden, kernel=1)
         self.head = conv(config.hidden, config.hidden, kernel=1)
         self.out = silent(conv(config.hidden, HYPOTHESES + 1, kernel=1))
 
@@ -186,27 +169,23 @@ class CoarseUpdate(nn.Module):
         d: Tensor,
         *,
         guess: tuple[Tensor, Tensor],
-        around: Tensor,
+        fills: Tensor,
         hole: Tensor,
         scores: Volume,
         context: Tensor,
     ) -> tuple[Tensor, Tensor, Hypotheses]:
-        """Hidden state and disparity [B, 1, H, W] px to the next ones; what was chosen among.
-
-        ``guess`` are the peaks of the scores, ``around`` what the surroundings suggest.
-        """
+        """Hidden state and disparity [B, 1, H, W] px to the next ones; what was chosen among."""
         guess_px, guess_log = guess
         top = scores.scores.amax(dim=-1)[:, None]
-        beside = lookup_row(scores, coarse_position(d, scores.last), REACH)
-        at_around = lookup(scores, coarse_position(around, scores.last))
-        log_p = (torch.cat((beside, at_around), dim=1) - top).clamp(-20, 0)
-        suggested = torch.cat((guess_px, around), dim=1)
+        around = lookup_row(scores, coarse_position(d, scores.last), REACH)
+        at_fills = lookup(scores, coarse_position(fills, scores.last))
+        log_p = (torch.cat((around, at_fills), dim=1) - top).clamp(-20, 0)
         inputs = torch.cat(
             (
                 context,
                 log_p * 0.1,
                 guess_log,
-                squash(suggested - d, 2.0),
+                squash(torch.cat((guess_px, fills), dim=1) - d, 2.0),
                 hole,
                 d * (1 / 64),
                 beyond(d, scale=8),
@@ -216,9 +195,9 @@ class CoarseUpdate(nn.Module):
         hidden = self.cell(hidden, inputs)
         learned = self.out(F.relu(self.head(hidden)))
         # Fixed part of the choice: the score itself, and a doubt about guesses that are not unique.
-        kept, at_around = log_p[:, REACH : REACH + 1], log_p[:, TAPS:]
-        fixed = torch.cat((kept + 1, 2 * guess_log, at_around - 1), dim=1)
-        surfaces = torch.cat((d, suggested), dim=1)
+        kept, at_fills = log_p[:, REACH : REACH + 1], log_p[:, TAPS:]
+        fixed = torch.cat((kept + 1, 2 * guess_log, at_fills - 1), dim=1)
+        surfaces = torch.cat((d, guess_px, fills), dim=1)
         hypotheses = Hypotheses(surfaces, fixed + 4 * learned[:, :HYPOTHESES])
         d = (hypotheses.mean() + 4 * learned[:, HYPOTHESES:]).clamp(min=MIN_PX)
         return hidden, d, hypotheses

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from vergence_models.config import LiteNetworkConfig
 from vergence_models.layers import conv, enlarge
-from vergence_models.lite.coarse import CELL, CELL_INPUTS
+from vergence_models.lite.coarse import CELL_INPUTS
 
 PATCH_BYTES = 4 * 4 * 3
 
@@ -31,7 +31,7 @@ class Context(nn.Module):
         self.thirtysecond = conv(low, low, kernel=1)
         self.sixteenth = conv(low, low, kernel=1)
         self.back = conv(low, eighth, kernel=1)
-        self.leave = conv(eighth, CELL - config.hidden - CELL_INPUTS, kernel=1)
+        self.leave = conv(eighth, 64 - config.hidden - CELL_INPUTS, kernel=1)
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """``image`` uint8 [B, H, W, 3]."""

@@ -22,14 +22,14 @@ from torch import Tensor
 
 from vergence_models.config import LiteNetworkConfig
 from vergence_models.layers import CensusDescriptor, added, all_pairs, banded
+from vergence_models.lite.closer import joined, larger_image, larger_state
 from vergence_models.lite.coarse import (
     BIN_PX,
     Clues,
     CoarseUpdate,
     CostFilter,
     extremes,
-    peaks,
-    rims,
+    peak,
     smooth_fill,
 )
 from vergence_models.lite.context import Context
@@ -37,7 +37,7 @@ from vergence_models.lite.hypotheses import Hypotheses
 from vergence_models.lite.losses import search_cross_entropy
 from vergence_models.lite.refinement import Refined, Refinement, near_columns
 from vergence_models.losses import known, masked_mean, output_loss, robust
-from vergence_models.network import Estimate, State, StereoNetwork
+from vergence_models.network import Estimate, Found, State, StereoNetwork
 from vergence_models.volume import whole_rows
 from vergence_models.warp import warp_state
 from vergence_proto.model_io import StateTensor
@@ -125,15 +125,29 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         state: State,
         iterations: int,
     ) -> tuple[LiteEstimate, LiteState]:
-        evidence = self.search(left, right)
         following = self.moved(LiteState(*state), uvd_curr_from_prev)
+        return self.iterated(self.search(left, right), following, iterations)
+
+    def closer_look(
+        self, left: Tensor, right: Tensor, found: Found, iterations: int
+    ) -> tuple[LiteEstimate, Found]:
+        search = self.search(larger_image(left), larger_image(right))
+        state = LiteState(*larger_state(*found.state))
+        estimate, state = self.iterated(search, state, iterations)
+        closer = Found(estimate.disparity, estimate.sigma, state)
+        return estimate, joined(found, closer, self.config.max_disparity_px)
+
+    def iterated(
+        self, evidence: Evidence, state: LiteState, iterations: int
+    ) -> tuple[LiteEstimate, LiteState]:
+        """The answer after so many iterations, from a state in the view of this frame."""
         guesses: list[Guess] = []
         for _ in range(iterations):
-            found = self.iterate(evidence, following)
-            following = LiteState(found.answer.disparity, found.hidden)
+            found = self.iterate(evidence, state)
+            state = LiteState(found.answer.disparity, found.hidden)
             guesses += found.guesses
         disparity, sigma = self.refinement.enlarged(found.answer)
-        return LiteEstimate(disparity, sigma, found.scores, guesses), following
+        return LiteEstimate(disparity, sigma, found.scores, guesses), state
 
     def moved(self, state: LiteState, uvd_curr_from_prev: Tensor) -> LiteState:
         """The state of the previous frame in the view of this one."""
@@ -166,15 +180,14 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         hole8 = (seen8 <= 0).to(prior.dtype)
         prior8 = F.avg_pool2d(prior, 2) / seen8.clamp(min=0.1)
         scores = whole_rows(self.cost_filter(evidence.clues, evidence.context16, prior8))
-        guess = peaks(scores)
-        best, confidence = guess[0][:, :1], torch.exp(4 * guess[1][:, :1])
-        fill = smooth_fill(best, confidence)
-        current = prior8 + hole8 * (fill - prior8)
+        guess = peak(scores)
+        confidence = torch.exp(4 * guess[1])
+        fill = smooth_fill(guess[0], confidence)
         hidden, d, hypotheses = self.update(
             hidden,
-            current,
+            prior8 + hole8 * (fill - prior8),
             guess=guess,
-            around=torch.cat((fill, extremes(best, confidence, fill), rims(current)), dim=1),
+            fills=torch.cat((fill, extremes(guess[0], confidence, fill)), dim=1),
             hole=hole8,
             scores=scores,
             context=evidence.context8,

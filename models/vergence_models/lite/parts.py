@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from vergence_models.graphs import (
@@ -16,10 +17,12 @@ from vergence_models.graphs import (
     step_inputs,
     step_output_names,
 )
+from vergence_models.lite.closer import joined, larger_image, larger_state
 from vergence_models.lite.coarse import Clues
 from vergence_models.lite.network import Evidence, LiteNetwork, LiteState
 from vergence_models.lite.refinement import Refined
-from vergence_models.stitch import TAKES_PLACE, Parts
+from vergence_models.network import Found
+from vergence_models.stitch import PLAIN, TAKES_PLACE, CloserLook, Parts
 from vergence_proto.model_io import LEFT, RIGHT
 
 NARROW = ("pairs", "context4", "context8", "context16")
@@ -57,6 +60,22 @@ class End(PartOf[LiteNetwork]):
         disparity, hidden, doubt, features = inputs
         refined = Refined(disparity, doubt, features)
         return *self.network.refinement.enlarged(refined), disparity, hidden
+
+
+class Enter(PartOf[LiteNetwork]):
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        left, right, *state = inputs
+        return larger_image(left), larger_image(right), *larger_state(*state)
+
+
+class Join(PartOf[LiteNetwork]):
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        plain, closer = (
+            Found(disparity, sigma, tuple(state))
+            for disparity, sigma, *state in (inputs[:4], inputs[4:])
+        )
+        disparity, sigma, state = joined(plain, closer, self.network.config.max_disparity_px)
+        return disparity, sigma, *state
 
 
 def parts_of(network: LiteNetwork) -> Parts[Part]:
@@ -101,4 +120,40 @@ def parts_of(network: LiteNetwork) -> Parts[Part]:
             (*moving, "doubt", "features4"),
             step_output_names(network),
         ),
+        closer=closer_look(network),
     )
+
+
+def closer_look(network: LiteNetwork) -> CloserLook[Part]:
+    """The way to twice the size and back."""
+    (left, right, _, *state), (image, *_) = step_inputs(network)
+    given, outputs = step_input_names(network), step_output_names(network)
+    enter, (height, width) = Enter(network), left.shape[1:3]
+    larger = enter.examples(left, right, *state)
+    maps = [torch.zeros(2, height, width) for _ in range(2)]
+    larger_maps = [torch.zeros(2, 2 * height, 2 * width) for _ in range(2)]
+    stride = network.config.stride
+    sizes, larger_sizes = (found_sizes(rows) for rows in (stride, 2 * stride))
+    return CloserLook(
+        enter=Part(
+            enter,
+            (left, right, *state),
+            (image, image, *sizes[2:]),
+            (LEFT, RIGHT, *outputs[2:]),
+            tuple(TAKES_PLACE + name for name in (LEFT, RIGHT, *given[3:])),
+        ),
+        moved=dict(zip(given[3:], (f"at_{name}" for name in LiteState._fields), strict=True)),
+        join=Part(
+            Join(network),
+            (*maps, *state, *larger_maps, *larger[2:]),
+            (*sizes, *larger_sizes),
+            (*(PLAIN + name for name in outputs), *outputs),
+            tuple(TAKES_PLACE + name for name in outputs),
+        ),
+    )
+
+
+def found_sizes(stride: int) -> tuple[Sizes, ...]:
+    """Of what a step finds in images that are multiples of ``stride``."""
+    plane: Sizes = {0: BATCH, 1: stride * ROWS, 2: stride * COLUMNS}
+    return plane, plane, cells(stride, 4), cells(stride, 8)

@@ -19,7 +19,7 @@ from vergence_models.layers import (
     silent,
     squash,
 )
-from vergence_models.lite.coarse import MIN_PX, beyond, rims
+from vergence_models.lite.coarse import MIN_PX, beyond
 from vergence_models.lite.hypotheses import Hypotheses
 from vergence_models.volume import Near, Volume, lookup, lookup_row
 from vergence_models.warp import cell_centres
@@ -33,6 +33,11 @@ TAPS = 2 * REACH + 1
 def near_columns(max_disparity_px: int) -> Near:
     """The columns of the right image that the fine search meets."""
     return Near(ratio=4 // FINE_PX, reach=max_disparity_px // FINE_PX, margin=REACH + 2)
+
+
+def rims(d: Tensor) -> Tensor:
+    """The largest and the smallest disparity of 3x3 cells: [B, 1, H, W] to [B, 2, H, W]."""
+    return torch.cat((F.max_pool2d(d, 3, 1, 1), -F.max_pool2d(-d, 3, 1, 1)), dim=1)
 
 
 class Refined(NamedTuple):
