@@ -34,6 +34,11 @@ def counted(iterations: int) -> str:
     return f"{iterations} iteration{'s' if iterations > 1 else ''}"
 
 
+def counted_start(network: SteppedNetwork, iterations: int) -> str:
+    closer = ", the last ones a closer look" if network.looks_closer(iterations) else ""
+    return counted(iterations) + closer
+
+
 def warm_method(network: SteppedNetwork, name: str, iterations: int, *, cold: int) -> Method:
     """Carries its state; ``cold`` iterations on the first frame."""
     return Method(
@@ -45,7 +50,7 @@ def warm_method(network: SteppedNetwork, name: str, iterations: int, *, cold: in
 def single_frame_method(network: SteppedNetwork, name: str, iterations: int) -> Method:
     """Forgets its state after every frame."""
     return Method(
-        f"{name}, every frame cold, {counted(iterations)}",
+        f"{name}, every frame cold, {counted_start(network, iterations)}",
         lambda footage: network.sequence(footage, cold=iterations, warm=None),
     )
 

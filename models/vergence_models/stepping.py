@@ -112,6 +112,10 @@ class SteppedNetwork(ABC):
     def start(self, left: Image, right: Image, iterations: int) -> tuple[Plane, Plane, State]:
         """As :meth:`run`, of frames that nothing is known before."""
 
+    @abstractmethod
+    def looks_closer(self, iterations: int) -> bool:
+        """Whether :meth:`start` with so many takes the last of them at twice the size."""
+
     def cold_state(self, height: int, width: int, batch: int = 1) -> State:
         """All zeros, for images of a size that ``card.step_size`` gives."""
         return tuple(
@@ -183,6 +187,9 @@ class OnnxNetwork(SteppedNetwork):
         still = NO_MOTION[None].repeat(batch, axis=0)
         nothing = self.cold_state(height, width, batch)
         return self._run(self.card.stages(iterations, cold=True), left, right, still, *nothing)
+
+    def looks_closer(self, iterations: int) -> bool:
+        return iterations in self.card.cold_graphs
 
     def _run(self, stages: Stages, *given: NDArray[np.generic]) -> tuple[Plane, Plane, State]:
         # Of any type: what one stage hands the next is the exporter's own business.

@@ -58,6 +58,9 @@ class TorchNetwork(SteppedNetwork):
         state = tuple(tensor.numpy() for tensor in found.state)
         return found.disparity.numpy(), found.sigma.numpy(), state
 
+    def looks_closer(self, iterations: int) -> bool:
+        return iterations in self._closer
+
 
 def as_tensors(left: Image, right: Image) -> tuple[Tensor, Tensor]:
     return (

@@ -5,7 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from vergence_models.evaluate import COLUMNS, figures
-from vergence_models.methods import Method, counted, sgbm_methods, with_pose_noise, without_poses
+from vergence_models.methods import (
+    Method,
+    counted_start,
+    sgbm_methods,
+    with_pose_noise,
+    without_poses,
+)
 from vergence_models.studies import paper
 from vergence_models.studies.bench import Bench, step_times_ms
 from vergence_models.studies.contenders import Contender
@@ -97,7 +103,8 @@ def warp_ablation(bench: Bench) -> Table:
         for count, method in zip(
             contender.single_frame[-1:], contender.single_frame_methods()[-1:], strict=True
         ):
-            variants[f"{contender.name}, no state, {counted(count)}"] = method
+            start = counted_start(contender.network, count)
+            variants[f"{contender.name}, no state, {start}"] = method
     cells: dict[str, dict[str, float]] = {label: {} for label in variants}
     for speed in WARP_SPEEDS:
         found = bench.tallies(bench.clips_at(speed), list(variants.values()))
