@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,19 @@ from vergence_models.data.pool import ClipPool
 from vergence_models.data.sensor import film_as_sensor
 from vergence_models.losses import known
 from vergence_models.motion import uvd_transforms
-from vergence_models.network import Estimate
+from vergence_models.network import Found
 from vergence_models.tiers import AnyNetwork
 
-COLD_ITERATIONS = 4
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """How the first frame of a clip is stepped."""
+
+    iterations: int = 4
+    closer: int = 0  # of them, the last ones
+
+
+START = Start()
 
 
 def filmed(pool: ClipPool, indices: range) -> StereoClips:
@@ -29,26 +39,31 @@ def filmed(pool: ClipPool, indices: range) -> StereoClips:
 
 @torch.inference_mode()
 def predict(
-    network: AnyNetwork, clips: StereoClips, device: torch.device, *, iterations: int = 1
-) -> list[Estimate]:
-    """The estimate of every frame of the clips, cold on the first, then warm."""
+    network: AnyNetwork, clips: StereoClips, device: torch.device, *, start: Start = START
+) -> list[Found]:
+    """What is found in every frame of the clips: cold in the first, then with one iteration."""
     matrices = uvd_transforms(clips, clips.world_from_left).to(device)
-    batch, frames, _, height, width = clips.left.shape
-    state = network.cold_state(batch, height, width)
-    estimates = []
-    for frame in range(frames):
+    steps: list[Found] = []
+    for frame in range(clips.left.shape[1]):
         left, right = (
             eye[:, frame].permute(0, 2, 3, 1).contiguous().to(device)
             for eye in (clips.left, clips.right)
         )
-        count = iterations if frame else COLD_ITERATIONS
-        estimate, state = network(left, right, matrices[:, frame], state, count)
-        estimates.append(estimate)
-    return estimates
+        if steps:
+            estimate, state = network(left, right, matrices[:, frame], steps[-1].state, 1)
+            steps.append(Found(estimate.disparity, estimate.sigma, state))
+        else:
+            steps.append(network.cold_step(left, right, start.iterations, closer=start.closer))
+    return steps
 
 
 def validate(
-    network: AnyNetwork, pool: ClipPool, device: torch.device, *, clips: int = 48
+    network: AnyNetwork,
+    pool: ClipPool,
+    device: torch.device,
+    *,
+    clips: int = 48,
+    start: Start = START,
 ) -> dict[str, float]:
     """Mean errors over the first ``clips`` of a pool: cold (frame 1) and warm (the others).
 
@@ -57,14 +72,14 @@ def validate(
     """
     sums: dict[str, list[float]] = {}
     limit = network.config.max_disparity_px
-    for start in range(0, min(clips, len(pool)), 8):
-        part = filmed(pool, range(start, min(start + 8, clips, len(pool))))
-        for frame, estimate in enumerate(predict(network, part, device)):
+    for first in range(0, min(clips, len(pool)), 8):
+        part = filmed(pool, range(first, min(first + 8, clips, len(pool))))
+        for frame, found in enumerate(predict(network, part, device, start=start)):
             truth = part.disparity_px[:, frame].to(device)
             mask = known(truth, limit) > 0
-            errors = (estimate.disparity - truth).abs()[mask]
+            errors = (found.disparity - truth).abs()[mask]
             kind = "warm" if frame else "cold"
-            for name, value in measures(errors, estimate.sigma[mask]).items():
+            for name, value in measures(errors, found.sigma[mask]).items():
                 sums.setdefault(f"{kind}_{name}", []).append(value)
     return {name: round(float(np.mean(values)), 4) for name, values in sums.items()}
 

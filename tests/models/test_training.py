@@ -26,7 +26,7 @@ from vergence_models.runs import (
 )
 from vergence_models.train import main
 from vergence_models.trainer import Trainer
-from vergence_models.validation import predict, validate
+from vergence_models.validation import validate
 
 NETWORK = LiteNetworkConfig(context_eighth=16, context_low=16)
 SMALL = Config(
@@ -133,7 +133,11 @@ def test_a_closer_look_is_learned_too(pool: Path) -> None:
 def test_unknown_truth_costs_nothing() -> None:
     trainer = Trainer(SMALL, torch.device("cpu"))
     clips = wall_clips(1)
-    [estimate, *_] = predict(trainer.network.eval(), clips, torch.device("cpu"))
+    left, right = (eye[:, 0].permute(0, 2, 3, 1).contiguous() for eye in (clips.left, clips.right))
+    network = trainer.network.eval()
+    still, nothing = torch.eye(4)[None], network.cold_state(1, *left.shape[1:3])
+    with torch.inference_mode():
+        estimate, _ = network(left, right, still, nothing, 1)
     truth = clips.disparity_px[:, 0]
     half = truth.clone()
     half[:, :, 112:] = 0

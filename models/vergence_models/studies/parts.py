@@ -23,7 +23,7 @@ from vergence_models.runs import RunError, read_run
 from vergence_models.studies.contenders import Training
 from vergence_models.studies.tables import Row, Table, markdown, write_tables
 from vergence_models.tiers import trained_network
-from vergence_models.validation import validate
+from vergence_models.validation import START, Start, validate
 
 COLUMNS = {
     f"{kind}_{key}": f"{kind} {label}"
@@ -31,6 +31,8 @@ COLUMNS = {
     for key, label in (("epe", "EPE"), ("d1", "D1 %"), ("d3", "D3 %"))
 }
 NEVER = -1e3  # a logit
+PATIENT = "all of it, 8 iterations on cold frames"
+CLOSER = "the same, the last 2 of them a closer look"
 
 
 def rims_never_chosen(network: LiteNetwork) -> None:
@@ -80,7 +82,10 @@ PARTS: dict[str, Callable[[LiteNetwork], None]] = {
     "1/4: no sub-pixel fit": silenced("refinement.subpixel"),
     "1/4: no last correction": silenced("refinement.out"),
     "bilinear enlargement": bilinear,
+    PATIENT: lambda network: None,
+    CLOSER: lambda network: None,
 }
+STARTS = {PATIENT: Start(8), CLOSER: Start(8, closer=2)}
 
 
 def table_of_parts(run_folder: Path, pool: ClipPool, *, clips: int) -> Table:
@@ -93,7 +98,8 @@ def table_of_parts(run_folder: Path, pool: ClipPool, *, clips: int) -> Table:
             raise RunError(f"{run_folder}: expected a run of lite, this is {run.config_name}")
         with torch.no_grad():
             silence(network)
-        figures = validate(network, pool, torch.device("cpu"), clips=clips)
+        start = STARTS.get(label, START)
+        figures = validate(network, pool, torch.device("cpu"), clips=clips, start=start)
         rows.append(Row(label, {key: figures[key] for key in COLUMNS}))
     return Table(
         name="parts",
