@@ -81,7 +81,6 @@ class TrainingConfig:
     reset_share: float = 0.1  # frames that lose their state
     foreign_share: float = 0.1  # frames whose state is in part another clip's of the batch
     cold_iterations: int = 4  # at most, drawn anew for every frame without a state
-    closer_share: float = 0.0  # of frames without a state, those that get a closer look
     precision: Precision = Precision.FP32
 
 
@@ -106,7 +105,6 @@ LITE_TRAINING = TrainingConfig(
     stretch_share=0.3,
     reset_share=0.3,
     cold_iterations=6,
-    closer_share=0.2,
 )
 # The paper's: Adam, no weight decay, an L1 loss that weighs every frame alike.
 RAFT_TRAINING = TrainingConfig(

@@ -76,15 +76,10 @@ class StereoNetwork(nn.Module, ABC, Generic[ConfigT]):
         nothing = self.cold_state(batch, height, width)
         estimate, state = self(left, right, still, nothing, iterations - closer)
         found = Found(estimate.disparity, estimate.sigma, state)
-        return self.closer_look(left, right, found, closer)[1] if closer else found
+        return self.closer_look(left, right, found, closer) if closer else found
 
-    def closer_look(
-        self, left: Tensor, right: Tensor, found: Found, iterations: int
-    ) -> tuple[Estimate, Found]:
-        """More iterations on a step's images, at twice the size.
-
-        Gives the estimate at that size, and what it makes of what was ``found`` before.
-        """
+    def closer_look(self, left: Tensor, right: Tensor, found: Found, iterations: int) -> Found:
+        """What more iterations at twice the size make of what was ``found`` in a step's images."""
         raise ValueError(f"{type(self).__name__} takes no closer look, got {iterations} iterations")
 
     def cold_state(self, batch: int, height: int, width: int) -> State:

@@ -12,9 +12,8 @@ from torch import Tensor
 
 from vergence_models.config import Config, Precision
 from vergence_models.data.clips import StereoClips
-from vergence_models.layers import enlarge
 from vergence_models.motion import perturbed, uvd_transforms
-from vergence_models.network import Found, State
+from vergence_models.network import State
 from vergence_models.runs import (
     CHECKPOINT_NAME,
     Progress,
@@ -157,14 +156,7 @@ class Trainer:
             with self.autocast():
                 estimate, state = network(left, right, matrices[:, frame], state, iterations)
             truth = clips.disparity_px[:, frame]
-            limit_px = self.config.network.max_disparity_px
-            loss = loss + estimate.loss(truth, limit_px) / frames
-            if reset and self.chance(training.closer_share):
-                found = Found(estimate.disparity, estimate.sigma, state)
-                more = int(self.random.integers(1, 3))
-                with self.autocast():
-                    near, (_, _, state) = network.closer_look(left, right, found, more)
-                loss = loss + near.loss(2 * enlarge(truth[:, None])[:, 0], limit_px) / frames
+            loss = loss + estimate.loss(truth, self.config.network.max_disparity_px) / frames
             errors.append((estimate.disparity.detach() - truth).abs()[truth > 0].mean().item())
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]  # torch annotates it so

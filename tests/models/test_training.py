@@ -119,17 +119,6 @@ def test_training_lowers_the_loss(pool: Path) -> None:
     assert sum(losses[-3:]) < sum(losses[:3])
 
 
-def test_a_closer_look_is_learned_too(pool: Path) -> None:
-    training = dataclasses.replace(SMALL.training, closer_share=1.0)
-    clips = ClipPool(pool).clips([0])
-    plain, closer = (
-        Trainer(config, torch.device("cpu")).step(clips)
-        for config in (SMALL, dataclasses.replace(SMALL, training=training))
-    )
-    assert closer["first"] == plain["first"]  # the same weights have seen the same frames
-    assert closer["loss"] > plain["loss"]  # and then some
-
-
 def test_unknown_truth_costs_nothing() -> None:
     trainer = Trainer(SMALL, torch.device("cpu"))
     clips = wall_clips(1)

@@ -3,6 +3,9 @@
 Most of what a lone frame gets wrong is smaller than the cells that it was matched in. The same
 weights see images of twice the size in cells of half the size, and start from what was found
 before. Four times the work is worth it where there is no past, and too much in every frame.
+
+No training knows of it: 2,000 steps with a closer look at a fifth of the cold frames made 3 % fewer
+pixels off by more than 1 px in it, and 2 % more off by more than 2 px.
 """
 
 from __future__ import annotations

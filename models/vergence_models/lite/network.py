@@ -128,14 +128,12 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         following = self.moved(LiteState(*state), uvd_curr_from_prev)
         return self.iterated(self.search(left, right), following, iterations)
 
-    def closer_look(
-        self, left: Tensor, right: Tensor, found: Found, iterations: int
-    ) -> tuple[LiteEstimate, Found]:
+    def closer_look(self, left: Tensor, right: Tensor, found: Found, iterations: int) -> Found:
         search = self.search(larger_image(left), larger_image(right))
         state = LiteState(*larger_state(*found.state))
         estimate, state = self.iterated(search, state, iterations)
         closer = Found(estimate.disparity, estimate.sigma, state)
-        return estimate, joined(found, closer, self.config.max_disparity_px)
+        return joined(found, closer, self.config.max_disparity_px)
 
     def iterated(
         self, evidence: Evidence, state: LiteState, iterations: int
