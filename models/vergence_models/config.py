@@ -94,6 +94,7 @@ class Config:
     iterations: tuple[int, ...] = (1, 2, 4, 8)  # graphs to export
     # Cold starts with graphs of their own: how many of their iterations are a closer look.
     closer: Mapping[int, int] = field(default_factory=dict)
+    closer_max_pixels: int = 1280 * 1024  # of an image; memory grows with the power of 1.5
 
 
 # Windows of a sharper camera need less blowing up; a stereo pair alone has to be good too, with

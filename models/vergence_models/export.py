@@ -135,6 +135,7 @@ def export_run(run: Run, config: Config, out: Path, *, int8_clips: ClipPool | No
         "stride": run.network.stride,
         "max_disparity_px": run.network.max_disparity_px,
         "state": [dataclasses.asdict(tensor) for tensor in network.state_tensors],
+        "cold_max_pixels": config.closer_max_pixels if config.closer else 0,
         "architecture": dataclasses.asdict(run.network),
         "parameters": sum(p.numel() for p in network.parameters()),
         "training": run.story,

@@ -178,15 +178,14 @@ class OnnxNetwork(SteppedNetwork):
         state: State,
         iterations: int,
     ) -> tuple[Plane, Plane, State]:
-        return self._run(
-            self.card.stages(iterations, cold=False), left, right, uvd_curr_from_prev, *state
-        )
+        return self._run(self.card.stages(iterations), left, right, uvd_curr_from_prev, *state)
 
     def start(self, left: Image, right: Image, iterations: int) -> tuple[Plane, Plane, State]:
         batch, height, width, _ = left.shape
         still = NO_MOTION[None].repeat(batch, axis=0)
         nothing = self.cold_state(height, width, batch)
-        return self._run(self.card.stages(iterations, cold=True), left, right, still, *nothing)
+        stages = self.card.stages(iterations, cold_pixels=height * width)
+        return self._run(stages, left, right, still, *nothing)
 
     def looks_closer(self, iterations: int) -> bool:
         return iterations in self.card.cold_graphs

@@ -20,7 +20,7 @@ class TorchNetwork(SteppedNetwork):
     def __init__(self, run: Run, *, threads: int = 2) -> None:
         torch.set_num_threads(threads)
         self._network = trained_network(run)
-        self._closer = load_config(run.config_name).closer
+        self._config = load_config(run.config_name)
         self.card = ModelCard(
             name=run.config_name,
             stride=run.network.stride,
@@ -52,14 +52,14 @@ class TorchNetwork(SteppedNetwork):
 
     @torch.inference_mode()
     def start(self, left: Image, right: Image, iterations: int) -> tuple[Plane, Plane, State]:
-        found = self._network.cold_step(
-            *as_tensors(left, right), iterations, closer=self._closer.get(iterations, 0)
-        )
+        small = left.shape[1] * left.shape[2] <= self._config.closer_max_pixels
+        closer = self._config.closer.get(iterations, 0) if small else 0
+        found = self._network.cold_step(*as_tensors(left, right), iterations, closer=closer)
         state = tuple(tensor.numpy() for tensor in found.state)
         return found.disparity.numpy(), found.sigma.numpy(), state
 
     def looks_closer(self, iterations: int) -> bool:
-        return iterations in self._closer
+        return iterations in self._config.closer
 
 
 def as_tensors(left: Image, right: Image) -> tuple[Tensor, Tensor]:

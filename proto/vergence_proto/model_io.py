@@ -6,7 +6,8 @@ The graphs of a stage do not need each other and may run side by side; each take
 the caller gives or what a graph of an earlier stage gave. Any graph may give an output of the
 model, and no two graphs of a count give the same name. Most models have a single graph per count:
 one stage of one graph. A model may start a stream in another way than it goes on: cold graphs take
-the place of the others where there is no state, at the counts that they are there for.
+the place of the others where there is no state, at the counts that they are there for, in images
+that are not too large for them.
 
 Inputs:
 
@@ -84,11 +85,17 @@ class ModelCard:
     graphs: Mapping[int, Stages]  # by iterations
     weights_sha256: str  # of all files together: the identity told to clients
     cold_graphs: Mapping[int, Stages] = field(default_factory=dict)  # by iterations; may be none
+    cold_max_pixels: int = 0  # of an image, as it is stepped: larger ones start as they go on
 
-    def stages(self, iterations: int, *, cold: bool) -> Stages:
-        """The graphs of a step, of a stream's first one if ``cold``. KeyError: no such count."""
+    def stages(self, iterations: int, *, cold_pixels: int | None = None) -> Stages:
+        """The graphs of a step; ``cold_pixels``, of its images, if it is a stream's first.
+
+        Raises KeyError: no such count.
+        """
         usual = self.graphs[iterations]
-        return self.cold_graphs.get(iterations, usual) if cold else usual
+        if cold_pixels is None or cold_pixels > self.cold_max_pixels:
+            return usual
+        return self.cold_graphs.get(iterations, usual)
 
     @property
     def input_names(self) -> tuple[str, ...]:
@@ -172,6 +179,7 @@ def load_model_card(weights_dir: Path, name: str) -> ModelCard:
         graphs=graphs,
         weights_sha256=hashlib.sha256(b"".join(digests)).hexdigest(),
         cold_graphs=cold_graphs,
+        cold_max_pixels=entry.get("cold_max_pixels", 0),
     )
 
 

@@ -5,6 +5,7 @@ may step it again; a sequence is a pure function of its frames.
 """
 
 import importlib.util
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -180,9 +181,9 @@ class OnnxStereoModel:
         return self._graphs.lanes if self._device is None else 1
 
     def warm_up(self, iterations: int, *cold_iterations: int) -> None:
-        self._graphs.load(iterations, cold=False)
+        self._graphs.load(iterations)
         for count in cold_iterations:
-            self._graphs.load(count, cold=True)
+            self._graphs.load(count, cold_pixels=0)
 
     def close(self) -> None:
         """End the threads that steps use; none may follow."""
@@ -197,7 +198,8 @@ class OnnxStereoModel:
 
     def _step(self, steps: Sequence[Step]) -> list[StepResult]:
         height, width = steps[0].view.left.shape[:2]
-        found = self._graphs.run(steps[0].iterations, self._feeds(steps), cold=steps[0].cold)
+        pixels = math.prod(self._card.step_size(height, width)) if steps[0].cold else None
+        found = self._graphs.run(steps[0].iterations, self._feeds(steps), cold_pixels=pixels)
         # What is not finite in a state that stays shows in the maps of the next step.
         to_check = [values for values in found.values() if not isinstance(values, Resident)]
         if not all(np.isfinite(values).all() for values in to_check):

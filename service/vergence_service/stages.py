@@ -96,12 +96,12 @@ class StagedGraphs:
         """End the threads; no step may follow."""
         self._beside.shutdown()
 
-    def load(self, iterations: int, *, cold: bool) -> list[list[_Part]]:
+    def load(self, iterations: int, *, cold_pixels: int | None = None) -> list[list[_Part]]:
         """The graphs of a step, from now on in memory.
 
         Raises ManifestError, the graphs do not fit together, and ProviderUnavailable.
         """
-        step = self._card.stages(iterations, cold=cold)
+        step = self._card.stages(iterations, cold_pixels=cold_pixels)
         with self._loading:
             if step not in self._steps:
                 self._steps[step] = self._loaded(iterations, step)
@@ -118,9 +118,9 @@ class StagedGraphs:
             needed.update(name for part in parts[0] for name in part.inputs)
         return parts
 
-    def run(self, iterations: int, given: Tensors, *, cold: bool) -> dict[str, Tensor]:
+    def run(self, iterations: int, given: Tensors, *, cold_pixels: int | None) -> dict[str, Tensor]:
         """One step of a batch: the card's inputs to the card's outputs, by name."""
-        stages = self.load(iterations, cold=cold)
+        stages = self.load(iterations, cold_pixels=cold_pixels)
         found: dict[str, Tensor] = {}
         with self._counted():
             for parts in stages:

@@ -29,6 +29,7 @@ def test_stages_answer_bit_for_bit_what_the_whole_graph_answers(threads: int) ->
 def test_a_start_runs_the_cold_graphs(tmp_path: Path) -> None:
     def start_otherwise(entry: Entry) -> None:
         entry["cold_graphs"] = {"1": entry["graphs"]["2"]}
+        entry["cold_max_pixels"] = HEIGHT * WIDTH
 
     network = OnnxNetwork(copied_weights(tmp_path, edit=start_otherwise), "staged")
     left, right = np.random.default_rng(2).integers(0, 255, (2, 1, HEIGHT, WIDTH, 3), np.uint8)

@@ -63,13 +63,15 @@ def test_a_missing_file_is_refused(tmp_path: Path) -> None:
 def test_a_first_step_has_graphs_of_its_own_where_there_are_any(tmp_path: Path) -> None:
     def start_otherwise(entry: Entry) -> None:
         entry["cold_graphs"] = {"1": [["left.onnx", "right.onnx"], ["staged_2.onnx"]]}
+        entry["cold_max_pixels"] = 1000
 
     weights = copied_weights(tmp_path, edit=start_otherwise)
     card = load_model_card(weights, "staged")
-    cold, warm = (card.stages(1, cold=cold) for cold in (True, False))
+    cold, warm = card.stages(1, cold_pixels=1000), card.stages(1)
     assert cold[-1] == (weights / "staged_2.onnx",)
     assert warm[-1] == (weights / "staged_1.onnx",)
-    assert card.stages(2, cold=True) == card.stages(2, cold=False)
+    assert card.stages(2, cold_pixels=1000) == card.stages(2)
+    assert card.stages(1, cold_pixels=1001) == warm
 
 
 def leave_out(entry: Entry) -> None:

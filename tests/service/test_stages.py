@@ -162,6 +162,7 @@ def test_a_batch_of_staged_steps_gives_each_stream_its_own() -> None:
 def test_a_stream_starts_with_cold_graphs_and_goes_on_with_the_others(tmp_path: Path) -> None:
     def start_otherwise(entry: Entry) -> None:
         entry["cold_graphs"] = {"1": entry["graphs"]["2"]}
+        entry["cold_max_pixels"] = RIG.width * RIG.height
 
     with opened("staged") as model:
         [first] = model.step([Step(make_view(1), None, 2)])
@@ -174,6 +175,18 @@ def test_a_stream_starts_with_cold_graphs_and_goes_on_with_the_others(tmp_path: 
     assert_same(begun, first)
     assert_same(gone_on, second)
     assert_same(without, first)
+
+
+def test_images_that_are_too_large_for_cold_graphs_start_with_the_others(tmp_path: Path) -> None:
+    def start_otherwise(entry: Entry) -> None:
+        entry["cold_graphs"] = {"1": entry["graphs"]["2"]}
+        entry["cold_max_pixels"] = RIG.width * RIG.height - 1
+
+    with opened("staged", weights=copied_weights(tmp_path, edit=start_otherwise)) as model:
+        [begun] = model.step([Step(make_view(1), None, 1)])
+    with opened("staged") as model:
+        [expected] = model.step([Step(make_view(1), None, 1)])
+    assert_same(begun, expected)
 
 
 def test_a_graph_that_several_counts_share_is_loaded_once(tmp_path: Path) -> None:
