@@ -11,7 +11,14 @@ from torch import Tensor
 
 from vergence_models.config import FAST_NETWORK, LiteNetworkConfig
 from vergence_models.evaluate import WEIGHTS
-from vergence_models.lite.closer import ELSEWHERE_PX, halved, joined, larger_image, larger_state
+from vergence_models.lite.closer import (
+    ELSEWHERE_PX,
+    SIGMA_SCALE,
+    halved,
+    joined,
+    larger_image,
+    larger_state,
+)
 from vergence_models.lite.network import LiteNetwork
 from vergence_models.network import Found
 from vergence_models.raft.network import RaftNetwork
@@ -65,7 +72,8 @@ def test_each_pixel_keeps_one_of_two_and_the_state_agrees(seed: int) -> None:
 
     before, doubt = plane(1, 120), plane(0.1, 4)
     after, its_doubt = plane(1, 95), plane(0.1, 4)
-    answer = joined(found(before, doubt), found(twice(after), twice(its_doubt)), MOST_PX)
+    larger = found(twice(after), twice(its_doubt) / (2 * SIGMA_SCALE))
+    answer = joined(found(before, doubt), larger, MOST_PX)
     too_near = before > MOST_PX / 2 - 4
     worse = ((after - before).abs() > ELSEWHERE_PX) & (its_doubt > doubt)
     kept = too_near | worse
