@@ -13,12 +13,12 @@ import onnxruntime
 from numpy.typing import NDArray
 from onnx import ModelProto, TensorProto, helper
 
+from vergence_models.config import Kind
 from vergence_models.data.clips import StereoClips
 from vergence_models.data.pool import ClipPool
 from vergence_models.motion import uvd_transforms
 from vergence_models.quantization_plan import plan
 from vergence_models.quantize import Scale, copy_of, quantized, with_weights_apart
-from vergence_models.stitch import Kind
 from vergence_models.validation import filmed
 from vergence_proto.model_io import DISPARITY, LEFT, RIGHT, UVD_CURR_FROM_PREV, StateTensor
 

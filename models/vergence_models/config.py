@@ -84,6 +84,17 @@ class TrainingConfig:
     precision: Precision = Precision.FP32
 
 
+@dataclass(frozen=True, slots=True, order=True)
+class Kind:
+    """Of a step; as words, part of a file's name."""
+
+    iterations: int
+    closer: int = 0  # of the iterations, the last ones, in cold steps alone
+
+    def __str__(self) -> str:
+        return f"{self.iterations}_cold" if self.closer else str(self.iterations)
+
+
 @dataclass(frozen=True, slots=True)
 class Config:
     """One tier."""

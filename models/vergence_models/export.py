@@ -24,17 +24,18 @@ from numpy.typing import NDArray
 from onnx import ModelProto
 
 from vergence_models.calibrate import make_int8
-from vergence_models.config import Config, ConfigError, load_config
+from vergence_models.config import Config, ConfigError, Kind, load_config
 from vergence_models.data.pool import ClipPool
 from vergence_models.graphs import Part, export_part, folded
 from vergence_models.lite.network import LiteNetwork
 from vergence_models.lite.parts import parts_of as lite_parts_of
+from vergence_models.network import Found
 from vergence_models.raft.network import RaftNetwork
 from vergence_models.raft.parts import parts_of as raft_parts_of
 from vergence_models.runs import Run, RunError, read_run
 from vergence_models.stages import handed_on, in_stages
 from vergence_models.stepping import OnnxNetwork, SteppedNetwork
-from vergence_models.stitch import CloserLook, Kind, Parts, stitched, write_with_shared_weights
+from vergence_models.stitch import CloserLook, Parts, stitched, write_with_shared_weights
 from vergence_models.tiers import AnyNetwork, trained_network
 from vergence_proto.model_io import MANIFEST_FORMAT, MANIFEST_NAME
 
@@ -65,24 +66,12 @@ def shifted_pair(
     return left[None].astype(np.uint8), right[None].astype(np.uint8)
 
 
-def check_cold_parity(network: AnyNetwork, graphs: SteppedNetwork, kind: Kind) -> float:
-    """As :func:`check_parity`, of a first step."""
-    height, width = 6 * network.config.stride, 8 * network.config.stride
-    left, right = shifted_pair(height, width, 0)
-    disparity, sigma, _ = graphs.start(left, right, kind.iterations)
-    with torch.inference_mode():
-        expected = network.cold_step(
-            torch.from_numpy(left), torch.from_numpy(right), kind.iterations, closer=kind.closer
-        )
-    worst = max(difference_px(disparity, expected.disparity), difference_px(sigma, expected.sigma))
-    return required(worst, graphs.card.name, kind)
-
-
 def check_parity(
-    network: AnyNetwork, graphs: SteppedNetwork, iterations: int, *, frames: int = 3
+    network: AnyNetwork, graphs: SteppedNetwork, kind: Kind, *, frames: int = 3
 ) -> float:
     """How far 99 % of pixels are from PyTorch's over a short sequence, in px.
 
+    A cold kind steps the first frame; the plain one of its count goes on from the state it left.
     Raises ParityError if that is more than :data:`PARITY_PX`.
     """
     height, width = 6 * network.config.stride, 8 * network.config.stride
@@ -91,34 +80,27 @@ def check_parity(
     matrix[0, 0, 3] = -2.0  # the view pans
     worst = 0.0
     for frame in range(frames):
-        left, right = shifted_pair(height, width, 0, pan_px=2 * frame)
-        disparity, sigma, carried = graphs.run(left, right, matrix, carried, iterations)
+        pair = shifted_pair(height, width, 0, pan_px=2 * frame)
+        left, right = (torch.from_numpy(image) for image in pair)
         with torch.inference_mode():
-            estimate, state = network(
-                torch.from_numpy(left),
-                torch.from_numpy(right),
-                torch.from_numpy(matrix),
-                state,
-                iterations,
-            )
-        for got, expected in ((disparity, estimate.disparity), (sigma, estimate.sigma)):
-            worst = max(worst, difference_px(got, expected))
-    return required(worst, graphs.card.name, Kind(iterations))
-
-
-def difference_px(got: NDArray[np.float32], expected: torch.Tensor) -> float:
-    """Of 99 % of pixels."""
-    return float(np.quantile(np.abs(got - expected.numpy()), 0.99))
-
-
-def required(difference: float, name: str, kind: Kind) -> float:
-    """The same. Raises ParityError if it is too large."""
-    if not difference < PARITY_PX:
+            if kind.closer and frame == 0:
+                disparity, sigma, carried = graphs.start(*pair, kind.iterations)
+                expected = network.cold_step(left, right, kind.iterations, closer=kind.closer)
+            else:
+                disparity, sigma, carried = graphs.run(*pair, matrix, carried, kind.iterations)
+                estimate, state = network(
+                    left, right, torch.from_numpy(matrix), state, kind.iterations
+                )
+                expected = Found(estimate.disparity, estimate.sigma, state)
+        state = expected.state
+        for got, wanted in ((disparity, expected.disparity), (sigma, expected.sigma)):
+            worst = max(worst, float(np.quantile(np.abs(got - wanted.numpy()), 0.99)))
+    if not worst < PARITY_PX:
         raise ParityError(
-            f"{name}_{kind}: differs from PyTorch by {difference:.2g} px at the 99th percentile, "
-            f"expected less than {PARITY_PX:g}"
+            f"{graphs.card.name}_{kind}: differs from PyTorch by {worst:.2g} px at the 99th "
+            f"percentile, expected less than {PARITY_PX:g}"
         )
-    return difference
+    return worst
 
 
 def export_run(run: Run, config: Config, out: Path, *, int8_clips: ClipPool | None = None) -> None:
@@ -145,10 +127,7 @@ def export_run(run: Run, config: Config, out: Path, *, int8_clips: ClipPool | No
         write_model(Path(folder), config.name, models, parts, entry)
         graphs = OnnxNetwork(Path(folder), config.name)
         for kind in models:
-            if kind.closer:
-                worst = check_cold_parity(network, graphs, kind)
-            else:
-                worst = check_parity(network, graphs, kind.iterations)
+            worst = check_parity(network, graphs, kind)
             log.info("%s_%s: within %.1e px of PyTorch", config.name, kind, worst)
     if int8_clips is not None:
         models, entry["int8"] = make_int8(

@@ -123,13 +123,14 @@ def is_scalar(value: onnx.ValueInfoProto) -> bool:
 
 
 def slim(path: Path) -> None:
-    """Drop what the exporter notes about the author's machine (stack traces, file paths)."""
+    """Drop what the exporter notes: stack traces, file paths, and sizes in an order of chance."""
     model = onnx.load(path)
     join_clamps(model)
     for node in model.graph.node:
         del node.metadata_props[:]
     del model.graph.value_info[:]
     del model.metadata_props[:]
+    del model.graph.metadata_props[:]
     onnx.save(model, path)
 
 

@@ -7,8 +7,9 @@ from itertools import chain
 
 from onnx import ModelProto, TensorProto, ValueInfoProto
 
+from vergence_models.config import Kind
 from vergence_models.quantize import BYTES
-from vergence_models.stitch import Kind, Parts
+from vergence_models.stitch import Parts
 
 
 class StageError(RuntimeError):

@@ -155,9 +155,7 @@ class OnnxNetwork(SteppedNetwork):
     def __init__(self, weights: Path, name: str, *, threads: int = 2) -> None:
         """Raises ManifestError: no such model, or a file of it is damaged."""
         self.card = load_model_card(weights, name)
-        steps = (*self.card.graphs.values(), *self.card.cold_graphs.values())
-        stages = [*chain(*steps)]
-        side_by_side = max(map(len, stages))
+        side_by_side = max(map(len, self.card.all_stages))
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = max(1, threads // side_by_side)
         # Both as the service sets them: planning the reuse of buffers only slows the start down,
@@ -166,7 +164,7 @@ class OnnxNetwork(SteppedNetwork):
         options.add_session_config_entry("session.intra_op.spin_duration_us", "20")
         self._sessions = {
             path: onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-            for path in {path for stage in stages for path in stage}
+            for path in {*chain(*self.card.all_stages)}
         }
         self._beside = ThreadPoolExecutor(min(threads, side_by_side))  # ends with this network
 

@@ -7,29 +7,19 @@ same weights, so those go into one file beside them.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
 
 import onnx
 from onnx import ModelProto, NodeProto, TensorProto
 
+from vergence_models.config import Kind
+
 T = TypeVar("T")
 SMALL_BYTES = 1024  # such tensors stay in the graph: shapes and scalars that runtimes fold
 ALIGNMENT = 4096  # runtimes map whole pages
 TAKES_PLACE = "to_"
 PLAIN = "plain_"  # before what was found by a look that was not the last
-
-
-@dataclass(frozen=True, slots=True, order=True)
-class Kind:
-    """Of a whole step; as words, part of a file's name."""
-
-    iterations: int
-    closer: int = 0  # of the iterations, the last ones, in cold steps alone
-
-    def __str__(self) -> str:
-        return f"{self.iterations}_cold" if self.closer else str(self.iterations)
 
 
 class CloserLook(NamedTuple, Generic[T]):

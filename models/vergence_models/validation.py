@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from vergence_models.config import Kind
 from vergence_models.data.clips import StereoClips
 from vergence_models.data.pool import ClipPool
 from vergence_models.data.sensor import film_as_sensor
@@ -20,16 +20,7 @@ from vergence_models.motion import uvd_transforms
 from vergence_models.network import Found
 from vergence_models.tiers import AnyNetwork
 
-
-@dataclass(frozen=True, slots=True)
-class Start:
-    """How the first frame of a clip is stepped."""
-
-    iterations: int = 4
-    closer: int = 0  # of them, the last ones
-
-
-START = Start()
+START = Kind(4)  # how the first frame of a clip is stepped
 
 
 def filmed(pool: ClipPool, indices: range) -> StereoClips:
@@ -39,7 +30,7 @@ def filmed(pool: ClipPool, indices: range) -> StereoClips:
 
 @torch.inference_mode()
 def predict(
-    network: AnyNetwork, clips: StereoClips, device: torch.device, *, start: Start = START
+    network: AnyNetwork, clips: StereoClips, device: torch.device, *, start: Kind = START
 ) -> list[Found]:
     """What is found in every frame of the clips: cold in the first, then with one iteration."""
     matrices = uvd_transforms(clips, clips.world_from_left).to(device)
@@ -63,7 +54,7 @@ def validate(
     device: torch.device,
     *,
     clips: int = 48,
-    start: Start = START,
+    start: Kind = START,
 ) -> dict[str, float]:
     """Mean errors over the first ``clips`` of a pool: cold (frame 1) and warm (the others).
 

@@ -98,6 +98,11 @@ class ModelCard:
         return self.cold_graphs.get(iterations, usual)
 
     @property
+    def all_stages(self) -> tuple[Stage, ...]:
+        """Of every step there is."""
+        return tuple(chain(*self.graphs.values(), *self.cold_graphs.values()))
+
+    @property
     def input_names(self) -> tuple[str, ...]:
         """What the caller of a step gives."""
         return LEFT, RIGHT, UVD_CURR_FROM_PREV, *(tensor.input_name for tensor in self.state)

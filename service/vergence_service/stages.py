@@ -79,8 +79,7 @@ class StagedGraphs:
         self._device = device
         self._sessions: dict[Path, InferenceSession] = {}
         self._steps: dict[Stages, list[list[_Part]]] = {}
-        steps = (*card.graphs.values(), *card.cold_graphs.values())
-        width = max(len(stage) for stages in steps for stage in stages)
+        width = max(map(len, card.all_stages))
         self.lanes = min(threads or _cores(), width)
         # A model that is cut for several threads leaves each of them its own graph, also in stages
         # of one: two threads that shared the last graph of `lite`, operator by operator, took 15 %

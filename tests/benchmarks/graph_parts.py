@@ -21,10 +21,10 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from vergence_models.config import RaftNetworkConfig, load_config
+from vergence_models.config import Kind, RaftNetworkConfig, load_config
 from vergence_models.export import exported_parts
 from vergence_models.raft.network import RaftNetwork
-from vergence_models.stitch import TAKES_PLACE, Kind, Parts, stitched, write_with_shared_weights
+from vergence_models.stitch import TAKES_PLACE, Parts, stitched, write_with_shared_weights
 from vergence_proto.model_io import LEFT, RIGHT, UVD_CURR_FROM_PREV
 
 HEIGHT, WIDTH = 480, 640

@@ -22,11 +22,11 @@ from vergence_models.calibrate import (
     scales_of,
     steps,
 )
+from vergence_models.config import Kind
 from vergence_models.data.clips import StereoClips
 from vergence_models.data.pool import ClipPool, write_shard
 from vergence_models.quantization_plan import Plan, plan
 from vergence_models.quantize import Scale, quantized, with_weights_apart
-from vergence_models.stitch import Kind
 from vergence_proto.model_io import StateTensor
 
 STATES = (StateTensor("disparity", 1, 4),)

@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 from rich.progress import track
 
-from vergence_models.config import ConfigError
+from vergence_models.config import ConfigError, Kind
 from vergence_models.data.pool import ClipPool
 from vergence_models.layers import ConvexUpsampler
 from vergence_models.lite.network import LiteNetwork
@@ -23,7 +23,7 @@ from vergence_models.runs import RunError, read_run
 from vergence_models.studies.contenders import Training
 from vergence_models.studies.tables import Row, Table, markdown, write_tables
 from vergence_models.tiers import trained_network
-from vergence_models.validation import START, Start, validate
+from vergence_models.validation import START, validate
 
 COLUMNS = {
     f"{kind}_{key}": f"{kind} {label}"
@@ -85,7 +85,7 @@ PARTS: dict[str, Callable[[LiteNetwork], None]] = {
     PATIENT: lambda network: None,
     CLOSER: lambda network: None,
 }
-STARTS = {PATIENT: Start(8), CLOSER: Start(8, closer=2)}
+STARTS = {PATIENT: Kind(8), CLOSER: Kind(8, closer=2)}
 
 
 def table_of_parts(run_folder: Path, pool: ClipPool, *, clips: int) -> Table:
