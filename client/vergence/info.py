@@ -24,6 +24,8 @@ class ServerInfo:
     version: str
     model: ModelInfo
     provider: str  # what the model runs on, as onnxruntime names it
+    engine: str  # what computes it, with its version; empty: an older server
+    instruction_set: str  # the best of the server's CPU for int8; empty: an older server
     streams_open: int
     streams_max: int
     max_message_bytes: int
@@ -35,6 +37,8 @@ class ServerInfo:
             version=message.version,
             model=ModelInfo.from_proto(message.model),
             provider=message.provider,
+            engine=message.engine,
+            instruction_set=message.instruction_set,
             streams_open=message.streams_open,
             streams_max=message.streams_max,
             max_message_bytes=message.max_message_bytes,

@@ -1,4 +1,4 @@
-"""Int8 graphs of a tier: ranges found on some clips, the loss measured on others.
+"""Int8 graphs of a tier: ranges and rounding found on some clips, the loss measured on others.
 
 The clips are synthetic, of the kind that validation uses. Each graph steps through them with its
 own state, so that the ranges are those of recurrent use.
@@ -17,8 +17,10 @@ from vergence_models.config import Kind
 from vergence_models.data.clips import StereoClips
 from vergence_models.data.pool import ClipPool
 from vergence_models.motion import uvd_transforms
+from vergence_models.pair_sums import overflowing
 from vergence_models.quantization_plan import plan
 from vergence_models.quantize import Scale, copy_of, quantized, with_weights_apart
+from vergence_models.rounding import inputs_of
 from vergence_models.validation import filmed
 from vergence_proto.model_io import DISPARITY, LEFT, RIGHT, UVD_CURR_FROM_PREV, StateTensor
 
@@ -34,7 +36,7 @@ MAX_LOSS = 1.03  # EPE of the int8 graph over that of the float one
 
 
 class QuantizationError(RuntimeError):
-    """An int8 graph loses too much."""
+    """An int8 graph loses too much, or computes something else on another CPU."""
 
 
 def make_int8(
@@ -46,7 +48,8 @@ def make_int8(
 ) -> tuple[dict[Kind, ModelProto], dict[str, object]]:
     """Int8 graphs of float ones, and the story for the manifest.
 
-    Raises QuantizationError if the smallest loses more than :data:`MAX_LOSS`.
+    Raises QuantizationError if the smallest loses more than :data:`MAX_LOSS`, or if a product in
+    any of them may overflow 16 bits.
     """
     clips = filmed(pool, range(RANGE_CLIPS))
     made: dict[Kind, ModelProto] = {}
@@ -54,8 +57,15 @@ def make_int8(
     for kind, whole in sorted(models.items()):
         model = with_weights_apart(whole)
         what = plan(model)
-        seen = steps(model, states, clips, what.measured, forget=kind.closer > 0)
-        int8 = quantized(model, what, scales_of(seen, what.measured))
+        cold = kind.closer > 0
+        seen = steps(model, states, clips, what.measured, forget=cold)
+        scales = scales_of(seen, what.measured)
+        convolutions = [each for each in model.graph.node if each.output[0] in what.convolutions]
+        names = sorted({each.input[0] for each in convolutions})
+        seen = steps(model, states, clips, names, forget=cold)
+        int8 = quantized(model, what, scales, inputs_of(seen, convolutions, model))
+        if wrong := overflowing(int8):
+            raise QuantizationError(f"{kind}: pair sums may overflow in {', '.join(wrong)}")
         if not made:
             before, after = (epe_px(each, states, pool, max_disparity_px) for each in (model, int8))
             if not after < MAX_LOSS * before:

@@ -2,18 +2,21 @@
 
 Activations are uint8; weights are int8, symmetric, with a scale per output channel: for this pair
 onnxruntime has its quickest kernels, three to four times as quick as float32. Images are bytes from
-the start, and sums of them are exact.
+the start. All sums are exact on every CPU (:mod:`vergence_models.pair_sums`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from onnx import ModelProto, NodeProto, TensorProto, helper, numpy_helper
 
+from vergence_models.pair_sums import finest_steps, in_safe_parts
 from vergence_models.quantization_plan import COPYING_OPS, Plan
+from vergence_models.rounding import Inputs, rounded
 
 Array = NDArray[np.generic]
 
@@ -58,9 +61,18 @@ def with_weights_apart(model: ModelProto) -> ModelProto:
     return model
 
 
-def quantized(model: ModelProto, what: Plan, scales: dict[str, Scale]) -> ModelProto:
-    """The same graph with Quantize and Dequantize nodes where the plan wants bytes."""
-    writer = _Writer(model, what, scales)
+def quantized(
+    model: ModelProto,
+    what: Plan,
+    scales: dict[str, Scale],
+    inputs: Mapping[str, Inputs] | None = None,
+) -> ModelProto:
+    """The same graph with Quantize and Dequantize nodes where the plan wants bytes.
+
+    ``inputs`` are those of convolutions, by the tensors that they give. Weights of the others
+    become the nearest whole numbers.
+    """
+    writer = _Writer(model, what, scales, inputs or {})
     for entry in model.graph.input:
         writer.send_as_bytes(entry.name)
     for node in model.graph.node:
@@ -74,9 +86,16 @@ def quantized(model: ModelProto, what: Plan, scales: dict[str, Scale]) -> ModelP
 class _Writer:
     """The nodes of the new graph in their order, and its constants."""
 
-    def __init__(self, model: ModelProto, what: Plan, scales: dict[str, Scale]) -> None:
+    def __init__(
+        self,
+        model: ModelProto,
+        what: Plan,
+        scales: dict[str, Scale],
+        inputs: Mapping[str, Inputs],
+    ) -> None:
         self._model = model
         self._plan = what
+        self._inputs = inputs
         scales = {**scales, **dict.fromkeys(what.images, Scale(np.float32(1), np.uint8(0)))}
         self._scales = {name: scales[source] for name, source in what.source.items()}
         self._old = {tensor.name: tensor for tensor in model.graph.initializer}
@@ -207,8 +226,12 @@ class _Writer:
     def _add_integer_product(self, node: NodeProto) -> None:
         image, weight = node.input
         values = numpy_helper.to_array(self._old[weight]).astype(np.int8)
-        inputs = [self._plan.images[image], self._constant(weight + BYTES, values)]
-        whole = self._add("MatMulInteger", inputs, f"{node.output[0]}.whole")
+        sums = []
+        for at, part in enumerate(in_safe_parts(values)):
+            end = f".{at}" if at else ""
+            inputs = [self._plan.images[image], self._constant(weight + BYTES + end, part)]
+            sums.append(self._add("MatMulInteger", inputs, f"{node.output[0]}.whole{end}"))
+        whole = self._add("Add", sums, f"{node.output[0]}.sum") if len(sums) > 1 else sums[0]
         self._add("Cast", [whole], node.output[0], to=TensorProto.FLOAT)
 
     def _weights(self, node: NodeProto) -> list[str]:
@@ -224,12 +247,17 @@ class _Writer:
             weight = np.pad(weight, ((0, spare), (0, 0), (0, 0), (0, 0)))
             bias = np.pad(bias, (0, spare))
         # Fine enough for the weights, and coarse enough for the bias, in 32 bits.
-        step = np.maximum(np.abs(weight).max(axis=(1, 2, 3)) / 127, np.abs(bias) / into / 2**30)
+        step = np.maximum(finest_steps(weight), np.abs(bias) / into / 2**30)
         step = np.maximum(step, 1e-12).astype(np.float32)
-        weight = np.rint(weight / step[:, None, None, None])
+        seen = self._inputs.get(result)
+        flat, wide = weight.reshape(len(weight), -1), step.astype(np.float64)
+        whole = rounded(flat, wide, None if seen is None else seen.covariance)
+        if seen is not None:
+            bias += (flat - whole * wide[:, None]) @ seen.mean
+        whole = whole.reshape(weight.shape)
         bias = np.rint(bias / (step * into))
         return [
-            self._dequantized(f"{result}.weight", weight.astype(np.int8), step),
+            self._dequantized(f"{result}.weight", whole.astype(np.int8), step),
             self._dequantized(f"{result}.bias", bias.astype(np.int32), step * into),
         ]
 

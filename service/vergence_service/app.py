@@ -94,7 +94,12 @@ async def running(
         waiting_frames=settings.grpc.waiting_frames,
         max_frame_bytes=max_frame_bytes,
     )
-    unary = UnaryMethods(engine, provider=model.provider, max_frame_bytes=max_frame_bytes)
+    unary = UnaryMethods(
+        engine,
+        computed_by=model.engine,
+        provider=model.provider,
+        max_frame_bytes=max_frame_bytes,
+    )
 
     def open_calls() -> OpenCalls:
         return OpenCalls(engine, limits=limits, clock=clock)

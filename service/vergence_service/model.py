@@ -26,7 +26,7 @@ from vergence_proto.model_io import (
     load_model_card,
 )
 from vergence_proto.types import Image, Plane
-from vergence_service.providers import Resident, Tensor, device_of, require_provider
+from vergence_service.providers import ENGINE, Resident, Tensor, device_of, require_provider
 from vergence_service.stages import StagedGraphs
 
 _NO_MOTION = np.eye(4, dtype=np.float32)
@@ -123,6 +123,11 @@ class StereoModel(Protocol):
         ...
 
     @property
+    def engine(self) -> str:
+        """What computes it, with its version."""
+        ...
+
+    @property
     def lanes(self) -> int:
         """How many threads may call ``step`` at once; above 1, a batch of several gains nothing."""
         ...
@@ -175,6 +180,10 @@ class OnnxStereoModel:
     @property
     def provider(self) -> str:
         return self._provider
+
+    @property
+    def engine(self) -> str:
+        return ENGINE
 
     @property
     def lanes(self) -> int:

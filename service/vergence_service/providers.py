@@ -8,6 +8,7 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
+ENGINE = f"onnxruntime {onnxruntime.__version__}"
 # The names a person writes in the settings, and onnxruntime's.
 PROVIDERS: Mapping[str, str] = {
     "cpu": "CPUExecutionProvider",

@@ -35,6 +35,7 @@ from vergence import DepthClient
 from vergence.cli.demo import bundled_sample
 from vergence.cli.uploads import Upload
 from vergence_proto.geometry import RectifiedRig
+from vergence_proto.instruction_set import instruction_set
 from vergence_proto.layouts import SourceFrame, StereoSource, open_source
 from vergence_proto.types import StereoRig
 from vergence_service.model import (
@@ -203,10 +204,11 @@ def main() -> None:
     parser.add_argument("--beside", type=int, default=10, help="sequences beside the live stream")
     parser.add_argument("--threads", type=int, default=2, help="of the model, here and there")
     figures = asyncio.run(measure(args := parser.parse_args()))
+    print(f"isa {instruction_set()}")  # noqa: T201
     for name, value in figures.items():
         print(f"{name:30} {value:8.2f}")  # noqa: T201
     if args.json:
-        args.json.write_text(json.dumps(figures, indent=2) + "\n")
+        args.json.write_text(json.dumps({"isa": instruction_set(), **figures}, indent=2) + "\n")
 
 
 if __name__ == "__main__":

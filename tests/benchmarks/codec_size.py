@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vergence_proto.codec.planes import compress_plane, decompress_plane
+from vergence_proto.instruction_set import instruction_set
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -201,6 +202,7 @@ def main() -> None:
         parser.error(f"no true disparity of {shape[1]}x{shape[0]} under {options.data}")
     cv2.setNumThreads(1)
     rows = measure(maps)
+    sys.stdout.write(f"isa {instruction_set()}\n")
     sys.stdout.write(f"{len(maps)} maps of {shape[1]}x{shape[0]}, uint16 at 1/{DENOMINATOR} px\n")
     sys.stdout.write(
         f"{'codec':36}{'KiB':>8}{'encode ms':>11}{'decode ms':>11}{'install MB':>12}\n"
@@ -212,7 +214,8 @@ def main() -> None:
         )
     if options.json:
         source = str(options.data) if options.data else "synthetic"
-        options.json.write_text(json.dumps({"maps": len(maps), "source": source, "rows": rows}))
+        about = {"isa": instruction_set(), "maps": len(maps), "source": source}
+        options.json.write_text(json.dumps({**about, "rows": rows}))
 
 
 if __name__ == "__main__":

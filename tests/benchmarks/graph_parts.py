@@ -25,6 +25,7 @@ from vergence_models.config import Kind, RaftNetworkConfig, load_config
 from vergence_models.export import exported_parts
 from vergence_models.raft.network import RaftNetwork
 from vergence_models.stitch import TAKES_PLACE, Parts, stitched, write_with_shared_weights
+from vergence_proto.instruction_set import instruction_set
 from vergence_proto.model_io import LEFT, RIGHT, UVD_CURR_FROM_PREV
 
 HEIGHT, WIDTH = 480, 640
@@ -100,9 +101,10 @@ def main() -> None:
             methods[f"in_turn_{count}_ms"] = partial(in_turn, sessions, feed, count)
         results = measure(methods, given.rounds)
     results |= {"embedded_mb": round(whole / 1e6, 1), "shared_mb": round(shared / 1e6, 1)}
-    sys.stdout.write(" ".join(f"{name} {value}" for name, value in results.items()) + "\n")
+    told = {"isa": instruction_set(), "model": given.model, **results}
+    sys.stdout.write(" ".join(f"{name} {value}" for name, value in told.items()) + "\n")
     if given.json:
-        given.json.write_text(json.dumps({"model": given.model, **results}) + "\n", "utf-8")
+        given.json.write_text(json.dumps(told) + "\n", "utf-8")
 
 
 if __name__ == "__main__":

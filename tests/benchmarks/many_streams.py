@@ -25,6 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from vergence import DepthClient, DepthSession, Pose, RectifiedRig
+from vergence_proto.instruction_set import instruction_set
 from vergence_service.model import packaged_weights_dir
 
 RIG = RectifiedRig(640, 480, 500.0, 500.0, 319.5, 319.5, 239.5, 0.1)
@@ -137,11 +138,13 @@ def main() -> None:
         for count, row in asyncio.run(measure(args)).items()
     }
     columns = list(next(iter(figures.values())))
+    print(f"isa {instruction_set()}")  # noqa: T201
     print("streams" + "".join(f"{name:>13}" for name in columns))  # noqa: T201
     for count, row in figures.items():
         print(f"{count:7}" + "".join(f"{row[name]:13.2f}" for name in columns))  # noqa: T201
     if args.json:
         settings = {key: vars(args)[key] for key in ("rate_hz", "seconds", "threads")}
+        settings["isa"] = instruction_set()
         args.json.write_text(json.dumps({**settings, "streams": figures}, indent=1) + "\n")
 
 

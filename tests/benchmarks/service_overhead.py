@@ -30,6 +30,7 @@ import numpy as np
 from vergence import Delivery, DepthClient, DepthSession, ImageEncoding
 from vergence_proto import codec
 from vergence_proto.geometry import Pose, RectifiedRig
+from vergence_proto.instruction_set import instruction_set
 from vergence_proto.types import Image, OutputFormat, PoseSample, StereoFrame
 from vergence_service.model import OnnxStereoModel, RecurrentState, Step, View, packaged_weights_dir
 
@@ -203,10 +204,11 @@ def main() -> None:
         asyncio.run(echo(args.echo))
         return
     figures = {name: round(value, 3) for name, value in asyncio.run(measure(args)).items()}
+    print(f"isa {instruction_set()}")  # noqa: T201
     for name, value in figures.items():
         print(f"{name:18} {value:9.3f}")  # noqa: T201
     if args.json:
-        args.json.write_text(json.dumps(figures, indent=1) + "\n")
+        args.json.write_text(json.dumps({"isa": instruction_set(), **figures}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

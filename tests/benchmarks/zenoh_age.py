@@ -35,6 +35,7 @@ import zenoh
 from zenoh.handlers import DefaultHandler, RingChannel
 
 from vergence import DepthClient, Pose, RectifiedRig
+from vergence_proto.instruction_set import instruction_set
 from vergence_proto.keys import StreamKeys, encoding_of
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.zenoh_inbox import Inbox
@@ -234,11 +235,13 @@ def main() -> None:
     rows["session"] = asyncio.run(consume_session(chosen.rate_hz, work_s, chosen.seconds))
     figures = {name: summary(ages) for name, ages in rows.items()}
     columns = list(figures["fifo"])
+    print(f"isa {instruction_set()}")  # noqa: T201
     print(f"{'':8}" + "".join(f"{name:>10}" for name in columns))  # noqa: T201
     for name, row in figures.items():
         print(f"{name:8}" + "".join(f"{row[column]:10.1f}" for column in columns))  # noqa: T201
     if chosen.json:
         settings = {key: vars(chosen)[key] for key in ("rate_hz", "work_ms", "seconds")}
+        settings["isa"] = instruction_set()
         chosen.json.write_text(json.dumps({**settings, "consumers": figures}, indent=2) + "\n")
 
 

@@ -20,6 +20,7 @@ from vergence import (
     Superseded,
     UnknownStream,
 )
+from vergence_proto.instruction_set import instruction_set
 
 
 async def test_waiting_in_vain_for_a_place_says_how_long_to_wait() -> None:
@@ -43,6 +44,8 @@ async def test_the_server_tells_about_itself_and_its_streams(
         server, stream = await client.server_info(), await client.stream_info("hall")
         assert session.model == server.model
     assert server.model.name == model.card.name
+    assert (server.engine, server.provider) == (model.engine, model.provider)
+    assert server.instruction_set == instruction_set()
     assert server.streams_open == 1
     assert (stream.attached, stream.frames_stepped, stream.step_count) == (True, 1, 1)
 

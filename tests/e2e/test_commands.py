@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from tests.e2e.wall import DISPARITY_PX, HEIGHT, WIDTH, write_pair, write_wall
+from vergence_proto.instruction_set import instruction_set
 
 PATIENCE_S = 60.0
 REPOSITORY = Path(__file__).parents[2]
@@ -198,6 +199,8 @@ def test_doctor_finds_the_weights_and_a_running_server(server: str) -> None:
     assert done.returncode == 0, done.stdout
     assert "lite" in done.stdout
     assert f"{server} runs" in done.stdout
+    # The lines of the machine and of the server, which are one.
+    assert done.stdout.count(instruction_set()) >= 2
 
 
 def test_help_of_a_contributed_command_is_its_own() -> None:

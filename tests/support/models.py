@@ -21,6 +21,7 @@ class RecallModel:
     """Offset = 4 + brightness / 64 + motion + half of the offset before: memory made visible."""
 
     provider = "numpy"
+    engine = "recall 1"
     card = ModelCard(
         name="recall",
         stride=1,

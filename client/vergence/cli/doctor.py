@@ -16,6 +16,7 @@ from rich.text import Text
 
 from vergence.client import DepthClient
 from vergence_proto.errors import DepthError
+from vergence_proto.instruction_set import UNKNOWN, instruction_set
 from vergence_proto.model_io import ManifestError, load_model_card
 
 # What each extra adds; the base install is checked besides.
@@ -44,7 +45,7 @@ class Finding:
 
 async def doctor(server: str, console: Console) -> bool:
     """Print all findings; False if something that everybody needs is wrong."""
-    findings = [_python(), *_packages(), *_ports(), _weights(), await _reachable(server)]
+    findings = [_python(), _cpu(), *_packages(), *_ports(), _weights(), await _reachable(server)]
     table = Table(show_header=False, box=None)
     for finding in findings:
         # As text: the brackets of an extra are not markup.
@@ -57,6 +58,12 @@ def _python() -> Finding:
     found = platform.python_version()
     verdict = Verdict.GOOD if sys.version_info >= (3, 11) else Verdict.BAD
     return Finding(verdict, "python", f"{found} (3.11 or newer is needed)")
+
+
+def _cpu() -> Finding:
+    found = instruction_set()
+    verdict = Verdict.NOTE if found == UNKNOWN else Verdict.GOOD
+    return Finding(verdict, "cpu", f"{found} (its best instruction set for int8)")
 
 
 def _packages() -> Iterator[Finding]:
@@ -110,5 +117,8 @@ async def _reachable(server: str) -> Finding:
         return Finding(Verdict.NOTE, "server", str(error))
     model = f"{info.model.name} {info.model.weights_sha256[:12]}"
     streams = f"{info.streams_open} of {info.streams_max} streams"
-    about = f"{server} runs {info.version}, model {model} on {info.provider}, {streams}"
+    place = f"{info.provider} of {info.engine}" if info.engine else info.provider
+    if info.instruction_set:
+        place += f" ({info.instruction_set})"
+    about = f"{server} runs {info.version}, model {model} on {place}, {streams}"
     return Finding(Verdict.GOOD, "server", about)

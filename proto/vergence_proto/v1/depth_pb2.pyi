@@ -440,7 +440,7 @@ class GetServerInfoRequest(_message.Message):
     def __init__(self) -> None: ...
 
 class GetServerInfoResponse(_message.Message):
-    __slots__ = ("version", "model", "provider", "streams_open", "streams_max", "max_message_bytes", "max_pixels")
+    __slots__ = ("version", "model", "provider", "streams_open", "streams_max", "max_message_bytes", "max_pixels", "engine", "instruction_set")
     VERSION_FIELD_NUMBER: _ClassVar[int]
     MODEL_FIELD_NUMBER: _ClassVar[int]
     PROVIDER_FIELD_NUMBER: _ClassVar[int]
@@ -448,6 +448,8 @@ class GetServerInfoResponse(_message.Message):
     STREAMS_MAX_FIELD_NUMBER: _ClassVar[int]
     MAX_MESSAGE_BYTES_FIELD_NUMBER: _ClassVar[int]
     MAX_PIXELS_FIELD_NUMBER: _ClassVar[int]
+    ENGINE_FIELD_NUMBER: _ClassVar[int]
+    INSTRUCTION_SET_FIELD_NUMBER: _ClassVar[int]
     version: str
     model: ModelInfo
     provider: str
@@ -455,7 +457,9 @@ class GetServerInfoResponse(_message.Message):
     streams_max: int
     max_message_bytes: int
     max_pixels: int
-    def __init__(self, version: _Optional[str] = ..., model: _Optional[_Union[ModelInfo, _Mapping]] = ..., provider: _Optional[str] = ..., streams_open: _Optional[int] = ..., streams_max: _Optional[int] = ..., max_message_bytes: _Optional[int] = ..., max_pixels: _Optional[int] = ...) -> None: ...
+    engine: str
+    instruction_set: str
+    def __init__(self, version: _Optional[str] = ..., model: _Optional[_Union[ModelInfo, _Mapping]] = ..., provider: _Optional[str] = ..., streams_open: _Optional[int] = ..., streams_max: _Optional[int] = ..., max_message_bytes: _Optional[int] = ..., max_pixels: _Optional[int] = ..., engine: _Optional[str] = ..., instruction_set: _Optional[str] = ...) -> None: ...
 
 class GetStreamRequest(_message.Message):
     __slots__ = ("stream_id",)

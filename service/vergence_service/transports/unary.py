@@ -3,6 +3,7 @@
 from importlib.metadata import version
 
 from vergence_proto import codec
+from vergence_proto.instruction_set import instruction_set
 from vergence_proto.model_io import ModelCard
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.engine import DepthEngine
@@ -11,8 +12,11 @@ from vergence_service.engine import DepthEngine
 class UnaryMethods:
     """Translates each question to the engine's words. Raises DepthError."""
 
-    def __init__(self, engine: DepthEngine, *, provider: str, max_frame_bytes: int) -> None:
+    def __init__(
+        self, engine: DepthEngine, *, computed_by: str, provider: str, max_frame_bytes: int
+    ) -> None:
         self._engine = engine
+        self._computed_by = computed_by
         self._provider = provider
         self._max_frame_bytes = max_frame_bytes
 
@@ -25,6 +29,8 @@ class UnaryMethods:
             streams_max=self._engine.streams.capacity,
             max_message_bytes=self._max_frame_bytes,
             max_pixels=self._engine.max_pixels,
+            engine=self._computed_by,
+            instruction_set=instruction_set(),
         )
 
     async def stream(self, request: pb.GetStreamRequest) -> pb.GetStreamResponse:
