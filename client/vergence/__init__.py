@@ -22,11 +22,11 @@ Everything public is in ``__all__``; modules behind it may change. The errors ar
 :mod:`vergence_proto.errors`, re-exported here.
 """
 
+from vergence.blocking import BlockingClient, BlockingSession, depth
 from vergence.client import DEFAULT_SERVER, DepthClient
 from vergence.info import ModelInfo, ServerInfo, StreamInfo
 from vergence.results import DepthResult, Drops, EventKind, SessionEvent
 from vergence.session import DepthSession
-from vergence.sync import BlockingClient, BlockingSession, depth
 from vergence.transports.base import ConnectionLost
 from vergence_proto.errors import (
     BadCalibration,

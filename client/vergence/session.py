@@ -8,10 +8,10 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from vergence.answers import Answers
-from vergence.flights import Flight
+from vergence.connection import RESET, Link
+from vergence.in_flight import Flight
 from vergence.info import ModelInfo
-from vergence.link import RESET, Link
+from vergence.responses import Answers
 from vergence.results import DepthResult, Drops, SessionEvent
 from vergence.transports.base import Transport
 from vergence_proto import codec

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from vergence_models.data.pool import ClipPool
-from vergence_models.methods import (
+from vergence_models.evaluation.methods import (
     Method,
     sgbm_methods,
     single_frame_method,
@@ -23,17 +23,17 @@ from vergence_models.methods import (
     with_pose_noise,
     without_poses,
 )
-from vergence_models.metrics import SHARES_PCT
-from vergence_models.stepping import (
+from vergence_models.evaluation.metric_accumulator import Tally, settled_frame
+from vergence_models.evaluation.metrics import SHARES_PCT
+from vergence_models.evaluation.stepping import (
     Footage,
     OnnxNetwork,
     SteppedNetwork,
     footage_from_clip,
     footage_from_source,
 )
-from vergence_models.tally import Tally, settled_frame
-from vergence_models.validation import filmed
-from vergence_proto.layouts import LayoutError, find_sources, open_source
+from vergence_models.training.validation import filmed
+from vergence_proto.datasets import LayoutError, find_sources, open_source
 from vergence_proto.model_io import ManifestError
 
 WEIGHTS = Path(__file__).parent / "weights"

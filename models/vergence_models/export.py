@@ -23,20 +23,24 @@ import torch
 from numpy.typing import NDArray
 from onnx import ModelProto
 
-from vergence_models.calibrate import make_int8
 from vergence_models.config import Config, ConfigError, Kind, load_config
 from vergence_models.data.pool import ClipPool
-from vergence_models.graphs import Part, export_part, folded
-from vergence_models.lite.network import LiteNetwork
-from vergence_models.lite.parts import parts_of as lite_parts_of
-from vergence_models.network import Found
-from vergence_models.raft.network import RaftNetwork
-from vergence_models.raft.parts import parts_of as raft_parts_of
-from vergence_models.runs import Run, RunError, read_run
-from vergence_models.stages import handed_on, in_stages
-from vergence_models.stepping import OnnxNetwork, SteppedNetwork
-from vergence_models.stitch import CloserLook, Parts, stitched, write_with_shared_weights
-from vergence_models.tiers import AnyNetwork, trained_network
+from vergence_models.evaluation.stepping import OnnxNetwork, SteppedNetwork
+from vergence_models.networks.base import AnyNetwork, Found
+from vergence_models.networks.lite.network import LiteNetwork
+from vergence_models.networks.raft.network import RaftNetwork
+from vergence_models.onnx_export.calibrate import make_int8
+from vergence_models.onnx_export.lite_parts import parts_of as lite_parts_of
+from vergence_models.onnx_export.modules import Part, export_part, folded
+from vergence_models.onnx_export.raft_parts import parts_of as raft_parts_of
+from vergence_models.onnx_export.stages import handed_on, in_stages
+from vergence_models.onnx_export.stitch import (
+    CloserLook,
+    Parts,
+    stitched,
+    write_with_shared_weights,
+)
+from vergence_models.training.runs import Run, RunError, read_run, trained_network
 from vergence_proto.model_io import MANIFEST_FORMAT, MANIFEST_NAME
 
 log = logging.getLogger("vergence_models.export")

@@ -28,10 +28,10 @@ import torch
 
 from vergence_models.config import CONFIGS, load_config
 from vergence_models.data.pool import ClipPool
-from vergence_models.feeding import batches
-from vergence_models.runs import CHECKPOINT_NAME, LOG_NAME, RunError
-from vergence_models.trainer import Trainer, learning_rate
-from vergence_models.validation import save_picture, validate
+from vergence_models.training.batches import batches
+from vergence_models.training.runs import CHECKPOINT_NAME, LOG_NAME, RunError
+from vergence_models.training.trainer import Trainer, learning_rate
+from vergence_models.training.validation import save_picture, validate
 
 log = logging.getLogger("vergence_models.train")
 

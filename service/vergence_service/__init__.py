@@ -1,4 +1,5 @@
 """The server: keeps one recurrent state per stream and answers frames with disparity.
 
-Read in this order: ``transports.depth_call``, ``engine``, ``streams``, ``batcher``, ``model``.
+Read in this order: ``transports.stream_call``, ``streams.engine``, ``streams.stream``,
+``inference.batcher``, ``inference.model``.
 """

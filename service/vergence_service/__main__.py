@@ -9,12 +9,12 @@ from typing import Annotated, Any
 import typer
 
 from vergence_proto.model_io import ManifestError
-from vergence_service.app import Running
-from vergence_service.app import serve as serve_until_stopped
-from vergence_service.memory import keep_freed_memory
-from vergence_service.providers import ProviderUnavailable
+from vergence_service.app.server import Running
+from vergence_service.app.server import serve as serve_until_stopped
+from vergence_service.inference.providers import ProviderUnavailable
+from vergence_service.malloc import keep_freed_memory
 from vergence_service.settings import SettingsError, load_settings
-from vergence_service.transports import ExtraMissing, PortTaken, ZenohUnreachable
+from vergence_service.transports.errors import ExtraMissing, PortTaken, ZenohUnreachable
 
 # What an operator can mend: told in one line, without a trace.
 _OPERATOR_ERRORS = (

@@ -34,18 +34,13 @@ import numpy as np
 from vergence import DepthClient
 from vergence.cli.demo import bundled_sample
 from vergence.cli.uploads import Upload
+from vergence_proto.datasets import SourceFrame, StereoSource, open_source
 from vergence_proto.geometry import RectifiedRig
 from vergence_proto.instruction_set import instruction_set
-from vergence_proto.layouts import SourceFrame, StereoSource, open_source
 from vergence_proto.types import StereoRig
-from vergence_service.model import (
-    OnnxStereoModel,
-    RecurrentState,
-    Step,
-    View,
-    packaged_weights_dir,
-)
-from vergence_service.sequences import without_truth
+from vergence_service.inference.model import RecurrentState, Step, View
+from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
+from vergence_service.jobs.sources import without_truth
 
 LIVE_HZ = 15.0
 SEQUENCES = 2  # in the queue at once

@@ -23,8 +23,13 @@ from numpy.typing import NDArray
 
 from vergence_models.config import Kind, RaftNetworkConfig, load_config
 from vergence_models.export import exported_parts
-from vergence_models.raft.network import RaftNetwork
-from vergence_models.stitch import TAKES_PLACE, Parts, stitched, write_with_shared_weights
+from vergence_models.networks.raft.network import RaftNetwork
+from vergence_models.onnx_export.stitch import (
+    TAKES_PLACE,
+    Parts,
+    stitched,
+    write_with_shared_weights,
+)
 from vergence_proto.instruction_set import instruction_set
 from vergence_proto.model_io import LEFT, RIGHT, UVD_CURR_FROM_PREV
 

@@ -26,7 +26,7 @@ import numpy as np
 
 from vergence import DepthClient, DepthSession, Pose, RectifiedRig
 from vergence_proto.instruction_set import instruction_set
-from vergence_service.model import packaged_weights_dir
+from vergence_service.inference.onnx_model import packaged_weights_dir
 
 RIG = RectifiedRig(640, 480, 500.0, 500.0, 319.5, 319.5, 239.5, 0.1)
 DISPARITY_PX = 12

@@ -21,10 +21,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vergence_models.sgbm import sgbm_disparity
+from vergence_models.evaluation.sgbm import sgbm_disparity
 from vergence_proto.geometry import Pose, RectifiedRig
 from vergence_proto.instruction_set import instruction_set
-from vergence_service.model import OnnxStereoModel, Step, View, packaged_weights_dir
+from vergence_service.inference.model import Step, View
+from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
 from vergence_service.settings import ModelSettings
 
 HEIGHT, WIDTH = 480, 640

@@ -32,7 +32,8 @@ from vergence_proto import codec
 from vergence_proto.geometry import Pose, RectifiedRig
 from vergence_proto.instruction_set import instruction_set
 from vergence_proto.types import Image, OutputFormat, PoseSample, StereoFrame
-from vergence_service.model import OnnxStereoModel, RecurrentState, Step, View, packaged_weights_dir
+from vergence_service.inference.model import RecurrentState, Step, View
+from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
 
 RIG = RectifiedRig(640, 480, 500.0, 500.0, 319.5, 319.5, 239.5, 0.1)
 DISPARITY_PX = 12

@@ -36,10 +36,10 @@ from zenoh.handlers import DefaultHandler, RingChannel
 
 from vergence import DepthClient, Pose, RectifiedRig
 from vergence_proto.instruction_set import instruction_set
-from vergence_proto.keys import StreamKeys, encoding_of
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_proto.zenoh_inbox import Inbox
-from vergence_proto.zenoh_peer import ZenohPeer, make_config
+from vergence_proto.zenoh.inbox import Inbox
+from vergence_proto.zenoh.keys import StreamKeys, encoding_of
+from vergence_proto.zenoh.session import ZenohPeer, make_config
 
 KEYS = StreamKeys("vergence", "benchmark")
 ATTACHMENT_ID = "benchmark"

@@ -7,7 +7,7 @@ import pytest
 from tests.support.models import RecallModel
 from tests.support.server import running_server
 from vergence import DepthClient
-from vergence_service.app import Running
+from vergence_service.app.server import Running
 
 
 @pytest.fixture

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.client.filming import EXACT, step
-from tests.client.proxy import Proxy, proxy_to
-from tests.client.waiting import eventually
 from tests.support.frames import RIG, make_frame
 from tests.support.models import RecallModel
+from tests.support.polling import eventually
+from tests.support.proxy import Proxy, proxy_to
 from tests.support.server import ManualClock, running_server
+from tests.support.session_frames import EXACT, step
 from vergence import (
     ConnectionLost,
     Delivery,

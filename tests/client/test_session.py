@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from tests.client.filming import EXACT, step, submit
 from tests.support.frames import FRAME_NS, RIG, make_frame
 from tests.support.models import RAISES
+from tests.support.session_frames import EXACT, step, submit
 from vergence import (
     Axes,
     BadPose,

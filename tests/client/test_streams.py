@@ -4,11 +4,11 @@ import asyncio
 
 import pytest
 
-from tests.client.filming import step, submit
-from tests.client.waiting import eventually
 from tests.support.frames import RIG
 from tests.support.models import RecallModel
+from tests.support.polling import eventually
 from tests.support.server import ManualClock, running_server
+from tests.support.session_frames import step, submit
 from vergence import (
     DepthClient,
     DepthSession,

@@ -10,13 +10,13 @@ import pytest
 from rich.console import Console
 
 from tests.e2e.test_commands import vergence
-from tests.e2e.wall import write_wall
 from tests.support.http import http_server
 from tests.support.models import NOT_FINITE, RecallModel
 from tests.support.sequences import make_frames, sequence_files, write_sequence, zip_bytes
 from tests.support.server import running_server
+from tests.support.textured_wall import write_wall
 from vergence.cli.batch import batch
-from vergence.cli.trouble import Trouble
+from vergence.cli.errors import Trouble
 
 
 async def run(paths: list[Path], server: str, out: Path, **query: Any) -> dict[str, Any]:

@@ -14,9 +14,9 @@ import httpx
 import numpy as np
 from rich.console import Console
 
-from tests.client.waiting import eventually
 from tests.support.http import disparities, ended, files_below, http_server, submit
 from tests.support.models import RecallModel
+from tests.support.polling import eventually
 from tests.support.sequences import make_frames, sequence_files, write_sequence, zip_bytes
 from tests.support.server import PATIENCE_S
 from vergence.cli.batch import batch
@@ -31,7 +31,14 @@ async def killed_server(
 ) -> AsyncIterator[httpx.AsyncClient]:
     """A server in a process of its own, which ends by SIGKILL."""
     process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "tests.e2e.batch_server", str(directory), str(step_s), str(port)),
+        *(
+            sys.executable,
+            "-m",
+            "tests.support.batch_server",
+            str(directory),
+            str(step_s),
+            str(port),
+        ),
         cwd=REPOSITORY,
         stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.PIPE,

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.e2e.wall import DISPARITY_PX, HEIGHT, WIDTH, write_pair, write_wall
+from tests.support.textured_wall import DISPARITY_PX, HEIGHT, WIDTH, write_pair, write_wall
 from vergence_proto.instruction_set import instruction_set
 
 PATIENCE_S = 60.0
@@ -23,9 +23,8 @@ def vergence(
 ) -> subprocess.CompletedProcess[str]:
     """Run the command; ``without`` is a package that shall not be importable."""
     hidden = f"sys.modules[{without!r}] = None; " if without else ""
-    code = (
-        f"import sys; {hidden}from vergence.cli.app import main; sys.argv[0] = 'vergence'; main()"
-    )
+    start = "from vergence.cli.__main__ import main; sys.argv[0] = 'vergence'; main()"
+    code = f"import sys; {hidden}{start}"
     return subprocess.run(
         [sys.executable, "-c", code, *map(str, arguments)],
         capture_output=True,

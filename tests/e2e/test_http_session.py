@@ -5,10 +5,10 @@ import asyncio
 import numpy as np
 import pytest
 
-from tests.client.proxy import proxy_to
 from tests.support.frames import RIG
 from tests.support.http import disparities, ended, http_to, submit
 from tests.support.models import RecallModel
+from tests.support.proxy import proxy_to
 from tests.support.sequences import make_frames, sequence_files, zip_bytes
 from tests.support.server import running_server
 from vergence import (
@@ -31,7 +31,7 @@ from vergence import (
 )
 from vergence_proto.geometry import RectifiedRig
 from vergence_proto.types import DisparityMap, StereoFrame
-from vergence_service.app import Running, drain
+from vergence_service.app.server import Running, drain
 
 FRAMES = make_frames(6)
 EXACT = OutputFormat(encoding=PlaneEncoding.FLOAT32)

@@ -5,8 +5,8 @@ import asyncio
 import numpy as np
 import pytest
 
-from tests.e2e.wall import write_wall
 from tests.support.server import running_server
+from tests.support.textured_wall import write_wall
 from vergence import (
     Delivery,
     DepthClient,
@@ -15,15 +15,10 @@ from vergence import (
     OutputFormat,
     PlaneEncoding,
 )
-from vergence_proto.layouts import StereoSource, open_source
+from vergence_proto.datasets import StereoSource, open_source
 from vergence_proto.types import Plane
-from vergence_service.model import (
-    OnnxStereoModel,
-    RecurrentState,
-    Step,
-    View,
-    packaged_weights_dir,
-)
+from vergence_service.inference.model import RecurrentState, Step, View
+from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
 
 COLD, WARM = 4, 1
 

@@ -6,11 +6,11 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from tests.client.waiting import eventually
-from tests.e2e.zenoh_sessions import LOSSLESS, lone_server, server_on, step, submit
 from tests.support.frames import RIG, make_frame
 from tests.support.models import RecallModel
+from tests.support.polling import eventually
 from tests.support.zenoh_net import address_of, free_endpoint, router
+from tests.support.zenoh_sessions import LOSSLESS, lone_server, server_on, step, submit
 from vergence import (
     ConnectionLost,
     Delivery,
@@ -25,7 +25,7 @@ from vergence import (
     UnknownStream,
     depth,
 )
-from vergence_service.app import Running
+from vergence_service.app.server import Running
 
 EXACT = OutputFormat(encoding=PlaneEncoding.FLOAT32, sigma=True, confidence=True)
 

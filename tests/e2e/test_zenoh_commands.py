@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.e2e.test_commands import vergence
-from tests.e2e.wall import write_wall
+from tests.support.textured_wall import write_wall
 from tests.support.zenoh_net import address_of, free_endpoint
 
 PATIENCE_S = 60.0

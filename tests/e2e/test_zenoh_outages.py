@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 
-from tests.client.waiting import eventually
-from tests.e2e.zenoh_sessions import LOSSLESS, attached, lone_server, server_on, step, submit
 from tests.support.frames import RIG
 from tests.support.models import RecallModel
+from tests.support.polling import eventually
 from tests.support.zenoh_net import router
+from tests.support.zenoh_sessions import LOSSLESS, attached, lone_server, server_on, step, submit
 from vergence import ConnectionLost, DepthClient, Draining, EventKind, Origin, SessionEvent
-from vergence_service.app import drain
+from vergence_service.app.server import drain
 
 
 async def test_a_live_stream_outlives_its_router_and_says_what_it_lost() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from tests.models.filming import SMALL
+from tests.support.tiny_scenes import SMALL
 from vergence_models.data.clips import StereoClips
 from vergence_models.data.generator import ClipGenerator
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.models.filming import SMALL
+from tests.support.tiny_scenes import SMALL
 from vergence_models.data.clips import StereoClips
 from vergence_models.data.generator import ClipGenerator
 from vergence_models.data.sensor import SensorConfig, film_as_sensor

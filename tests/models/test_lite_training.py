@@ -10,13 +10,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.models.clips import wall_clips
+from tests.support.clips import wall_clips
 from vergence_models.data.generator import ClipGenerator, GeneratorConfig
 from vergence_models.data.pool import ClipPool, write_shard
-from vergence_models.lite.hypotheses import Hypotheses
+from vergence_models.networks.lite.hypotheses import Hypotheses
 from vergence_models.studies.parts import PARTS, main, table_of_parts
 from vergence_models.studies.tables import read_tables
-from vergence_models.trainer import partly_foreign
+from vergence_models.training.trainer import partly_foreign
 
 RUN = Path(__file__).parents[2] / "models" / "runs" / "lite"
 

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.models.clips import wall_clips
+from tests.support.clips import wall_clips
 from vergence_models.data.pool import write_shard
 from vergence_models.evaluate import main
+from vergence_models.evaluation.metric_accumulator import settled_frame
+from vergence_models.evaluation.metrics import calibration, error_measures, temporal_error
+from vergence_models.evaluation.sgbm import filled, sgbm_disparity
+from vergence_models.evaluation.stepping import footage_from_clip
 from vergence_models.export import shifted_pair
-from vergence_models.metrics import calibration, error_measures, temporal_error
-from vergence_models.sgbm import filled, sgbm_disparity
-from vergence_models.stepping import footage_from_clip
-from vergence_models.tally import settled_frame
 from vergence_proto.geometry import Pose
 
 

@@ -14,20 +14,20 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from tests.models.trained import as_trained
+from tests.support.trained import as_trained
 from vergence_models.config import Config, Kind, LiteNetworkConfig
 from vergence_models.evaluate import WEIGHTS
+from vergence_models.evaluation.stepping import OnnxNetwork
 from vergence_models.export import (
     PARITY_PX,
     check_parity,
     export_run,
     shifted_pair,
 )
-from vergence_models.graphs import COLUMNS, Part, export_part
-from vergence_models.layers import all_pairs, banded, best_rival
-from vergence_models.lite.network import LiteNetwork, LiteState
-from vergence_models.runs import Run
-from vergence_models.stepping import OnnxNetwork
+from vergence_models.networks.layers import all_pairs, banded, best_rival
+from vergence_models.networks.lite.network import LiteNetwork, LiteState
+from vergence_models.onnx_export.modules import COLUMNS, Part, export_part
+from vergence_models.training.runs import Run
 
 HEIGHT, WIDTH = 192, 256
 

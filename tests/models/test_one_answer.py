@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from vergence.cli.demo import bundled_sample
 from vergence_models.evaluate import WEIGHTS
-from vergence_models.stepping import Footage, OnnxNetwork, footage_from_source
+from vergence_models.evaluation.stepping import Footage, OnnxNetwork, footage_from_source
+from vergence_proto.datasets import open_source
 from vergence_proto.instruction_set import instruction_set
-from vergence_proto.layouts import open_source
 from vergence_proto.model_io import load_model_card
 
 RECORDED = Path(__file__).with_name("recorded_answer.npz")

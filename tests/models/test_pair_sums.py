@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from onnx import ModelProto, TensorProto, helper, numpy_helper
 
 from vergence_models.evaluate import WEIGHTS
-from vergence_models.pair_sums import MOST, in_safe_parts, largest_pair, overflowing
-from vergence_models.quantization_plan import plan
-from vergence_models.quantize import Scale, quantized
-from vergence_models.rounding import Inputs
+from vergence_models.onnx_export.pair_sums import MOST, in_safe_parts, largest_pair, overflowing
+from vergence_models.onnx_export.quantization_plan import plan
+from vergence_models.onnx_export.quantize import Scale, quantized
+from vergence_models.onnx_export.rounding import Inputs
 from vergence_proto.model_io import MANIFEST_NAME
 
 Array = NDArray[Any]

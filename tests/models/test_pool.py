@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.models.filming import agreement, furnished_room
+from tests.support.tiny_scenes import agreement, furnished_room
 from vergence_models.data import pool
 from vergence_models.data.clips import StereoClips
 from vergence_models.data.generator import ClipGenerator, GeneratorConfig

@@ -13,8 +13,11 @@ import pytest
 from numpy.typing import NDArray
 from onnx import ModelProto, NodeProto, TensorProto, helper, numpy_helper
 
-from tests.models.clips import wall_clips
-from vergence_models.calibrate import (
+from tests.support.clips import wall_clips
+from vergence_models.config import Kind
+from vergence_models.data.clips import StereoClips
+from vergence_models.data.pool import ClipPool, write_shard
+from vergence_models.onnx_export.calibrate import (
     MAX_LOSS,
     RANGE_CLIPS,
     QuantizationError,
@@ -22,11 +25,8 @@ from vergence_models.calibrate import (
     scales_of,
     steps,
 )
-from vergence_models.config import Kind
-from vergence_models.data.clips import StereoClips
-from vergence_models.data.pool import ClipPool, write_shard
-from vergence_models.quantization_plan import Plan, plan
-from vergence_models.quantize import Scale, quantized, with_weights_apart
+from vergence_models.onnx_export.quantization_plan import Plan, plan
+from vergence_models.onnx_export.quantize import Scale, quantized, with_weights_apart
 from vergence_proto.model_io import StateTensor
 
 STATES = (StateTensor("disparity", 1, 4),)

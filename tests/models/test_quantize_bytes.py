@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from onnx import ModelProto, NodeProto, TensorProto, helper, numpy_helper
 
-from vergence_models.quantization_plan import plan
-from vergence_models.quantize import Scale, quantized
+from vergence_models.onnx_export.quantization_plan import plan
+from vergence_models.onnx_export.quantize import Scale, quantized
 
 Array = NDArray[Any]
 

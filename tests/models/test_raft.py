@@ -11,15 +11,15 @@ import onnxruntime
 import pytest
 import torch
 
-from tests.models.trained import as_trained
+from tests.support.trained import as_trained
 from vergence_models.config import Config, Kind, RaftNetworkConfig
+from vergence_models.evaluation.stepping import OnnxNetwork
 from vergence_models.export import PARITY_PX, check_parity, export_run, shifted_pair
-from vergence_models.graphs import export_part, folded
-from vergence_models.raft.network import RaftNetwork, RaftState
-from vergence_models.raft.parts import parts_of
-from vergence_models.raft.update import looked_up, pyramid
-from vergence_models.runs import Run
-from vergence_models.stepping import OnnxNetwork
+from vergence_models.networks.raft.network import RaftNetwork, RaftState
+from vergence_models.networks.raft.update import looked_up, pyramid
+from vergence_models.onnx_export.modules import export_part, folded
+from vergence_models.onnx_export.raft_parts import parts_of
+from vergence_models.training.runs import Run
 from vergence_proto.model_io import ManifestError, load_model_card
 
 HEIGHT, WIDTH = 96, 224

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.models.filming import (
+from tests.support.tiny_scenes import (
     BASELINE_M,
     FOCAL_PX,
     PAINT,

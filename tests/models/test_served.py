@@ -11,14 +11,15 @@ from numpy.typing import NDArray
 
 from tests.support.server import running_server
 from vergence import Delivery, DepthClient, OutputFormat, PlaneEncoding, RectifiedRig
-from vergence_models import calibrate, export
+from vergence_models import export
 from vergence_models.evaluate import WEIGHTS
 from vergence_models.export import shifted_pair
-from vergence_models.runs import read_run
-from vergence_models.tiers import AnyNetwork, trained_network
+from vergence_models.networks.base import AnyNetwork
+from vergence_models.onnx_export import calibrate
+from vergence_models.training.runs import read_run, trained_network
 from vergence_proto.geometry import Pose, uvd_curr_from_prev
 from vergence_proto.model_io import MANIFEST_NAME
-from vergence_service.model import OnnxStereoModel
+from vergence_service.inference.onnx_model import OnnxStereoModel
 
 # The run that the shipped graphs were exported from.
 RUN = Path(__file__).parents[2] / "models" / "runs" / "lite"

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from onnx import ModelProto, NodeProto, TensorProto, helper, numpy_helper
 
 from vergence_models.config import Kind
-from vergence_models.stages import StageError, handed_on, in_stages
-from vergence_models.stitch import CloserLook, Parts, stitched
+from vergence_models.onnx_export.stages import StageError, handed_on, in_stages
+from vergence_models.onnx_export.stitch import CloserLook, Parts, stitched
 
 Array = NDArray[Any]
 KINDS = (Kind(1), Kind(3), Kind(3, closer=1))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.support.weights_copy import WEIGHTS, Entry, copied_weights
-from vergence_models.stepping import OnnxNetwork
+from vergence_models.evaluation.stepping import OnnxNetwork
 
 HEIGHT, WIDTH = 40, 70
 

@@ -11,28 +11,27 @@ import torch
 from rich.console import Console
 from rich.progress import Progress
 
-from tests.models.clips import wall_clips
-from vergence_models.calibrate import PARITY_PX
+from tests.support.clips import wall_clips
 from vergence_models.data.generator import ClipGenerator, GeneratorConfig
 from vergence_models.data.shots import Playback
 from vergence_models.evaluate import WEIGHTS
-from vergence_models.methods import (
+from vergence_models.evaluation.methods import (
     single_frame_method,
     warm_method,
     with_pose_noise,
     without_poses,
 )
-from vergence_models.runs import RunError, read_history, read_run
-from vergence_models.stepping import Footage, SteppedNetwork, footage_from_clip
+from vergence_models.evaluation.stepping import Footage, SteppedNetwork, footage_from_clip
+from vergence_models.onnx_export.calibrate import PARITY_PX
 from vergence_models.studies.__main__ import main
 from vergence_models.studies.bench import Bench
-from vergence_models.studies.contenders import (
+from vergence_models.studies.footage import SPEEDS, StudySettings
+from vergence_models.studies.learning import learning_curves
+from vergence_models.studies.networks import (
     Contender,
     gather_contenders,
     missing_tiers,
 )
-from vergence_models.studies.footage import SPEEDS, StudySettings
-from vergence_models.studies.learning import learning_curves
 from vergence_models.studies.plan import (
     STUDIES,
     cold_start,
@@ -43,6 +42,7 @@ from vergence_models.studies.plan import (
     warp_ablation,
 )
 from vergence_models.studies.tables import Table, markdown, read_tables, write_tables
+from vergence_models.training.runs import RunError, read_history, read_run
 
 RUN = Path(__file__).parents[2] / "models" / "runs" / "lite"
 TINY = StudySettings(clips=1, frames=4, short=4, width=192, height=64)

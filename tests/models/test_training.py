@@ -10,23 +10,23 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.models.clips import wall_clips
+from tests.support.clips import wall_clips
 from vergence_models import config as configs
 from vergence_models.config import Config, LiteNetworkConfig, TrainingConfig, load_config
 from vergence_models.data.pool import ClipPool, write_shard
-from vergence_models.feeding import batches
-from vergence_models.losses import doubt_loss
-from vergence_models.motion import perturbed, uvd_transforms
-from vergence_models.runs import (
+from vergence_models.networks.losses import doubt_loss
+from vergence_models.train import main
+from vergence_models.training.batches import batches
+from vergence_models.training.motion import perturbed, uvd_transforms
+from vergence_models.training.runs import (
     CHECKPOINT_NAME,
     RunError,
     load_checkpoint,
     read_run,
     save_checkpoint,
 )
-from vergence_models.train import main
-from vergence_models.trainer import Trainer
-from vergence_models.validation import validate
+from vergence_models.training.trainer import Trainer
+from vergence_models.training.validation import validate
 
 NETWORK = LiteNetworkConfig(context_eighth=16, context_low=16)
 SMALL = Config(

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from vergence_models.warp import (
+from vergence_models.networks.warp import (
     cell_centres,
     fill_cracks,
     inverse_4x4,

@@ -22,7 +22,7 @@ from vergence_models.data.xrbench.recipe import KINDS, SETS, BadRecipe, Effects,
 from vergence_models.data.xrbench.sheet import contact_sheet
 from vergence_models.data.xrbench.things import Room
 from vergence_models.data.xrbench.writer import render_sequence
-from vergence_proto.layouts import open_source
+from vergence_proto.datasets import open_source
 
 TINY = Recipe("studio", frames=1, width=32, height=24, samples=4, fps=20, baseline_m=0.07)
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.proto.strategies import rotation_about
+from tests.support.strategies import rotation_about
 from vergence_proto.accuracy import Accuracy, accuracy, error_tail, temporal_epe
 from vergence_proto.geometry import Matrix, Pose, RectifiedRig
 from vergence_proto.types import Plane

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from tests.proto.strategies import NOT_FINITE, POSES, RIG, assert_same_pose
+from tests.support.strategies import NOT_FINITE, POSES, RIG, assert_same_pose
 from vergence_proto import codec
 from vergence_proto.errors import BadImage, BadShape, FrameTooLarge
 from vergence_proto.geometry import Pose

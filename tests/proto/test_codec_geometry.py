@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.proto.strategies import NOT_FINITE, POSES, RIG, RIGS, assert_same_pose
+from tests.support.strategies import NOT_FINITE, POSES, RIG, RIGS, assert_same_pose
 from vergence_proto import codec
 from vergence_proto.errors import BadCalibration, BadPose
 from vergence_proto.geometry import Pose, RectifiedRig

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.proto.strategies import (
+from tests.support.strategies import (
     ANGLES,
     DIRECTIONS,
     POSES,

@@ -12,7 +12,7 @@ from tests.support.server import ManualClock, RawCall, connected, raw_stream, ru
 from tests.support.status import reason_of
 from vergence_proto.types import StereoRig
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_service.app import Running
+from vergence_service.app.server import Running
 
 
 async def detached(server: Running, stream_id: str) -> None:

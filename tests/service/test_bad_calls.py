@@ -12,7 +12,7 @@ from tests.support.models import RecallModel
 from tests.support.server import RawCall, connected, raw_stream, running_server
 from tests.support.status import reason_of
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_service.app import Running
+from vergence_service.app.server import Running
 
 
 async def ends_with(call: RawCall, message: pb.StreamDepthRequest) -> str:

@@ -16,7 +16,7 @@ from tests.support.server import RawCall, connected, raw_stream, running_server
 from tests.support.status import reason_of
 from vergence_proto.errors import ERROR_CLASSES, BadImage, BadPose, ErrorCode
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_service.transports.grpc_errors import GRPC_STATUS
+from vergence_service.transports.grpc.errors import GRPC_STATUS
 
 Spoil = Callable[[pb.Frame], object]
 

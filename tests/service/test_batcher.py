@@ -13,9 +13,9 @@ from tests.support.models import NOT_FINITE, RAISES, RecallModel
 from tests.support.server import ManualClock
 from vergence_proto.errors import Draining, FrameStale, ModelFailed, NonFinite
 from vergence_proto.geometry import RectifiedRig
-from vergence_service.batcher import StepBatcher, TimedResult
+from vergence_service.inference.batcher import StepBatcher, TimedResult
+from vergence_service.inference.model import Step, View
 from vergence_service.metrics import Metrics
-from vergence_service.model import Step, View
 
 
 def make_batcher(

@@ -9,18 +9,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tests.client.waiting import eventually
 from tests.support.frames import RIG, make_frame
 from tests.support.models import RecallModel
+from tests.support.polling import eventually
 from tests.support.sequences import make_frames, write_sequence
 from tests.support.server import running_server
 from vergence_proto.accuracy import Accuracy
-from vergence_service.checkpoints import read_checkpoint, write_checkpoint
-from vergence_service.job_run import Progress, run_job
-from vergence_service.jobs import Job, JobOptions
-from vergence_service.model import OnnxStereoModel, Step, StepResult, View, packaged_weights_dir
-from vergence_service.results import read_frames
-from vergence_service.snapshots import BadSnapshot, state_from_bytes, state_to_bytes
+from vergence_service.inference.model import Step, StepResult, View
+from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
+from vergence_service.inference.snapshots import BadSnapshot, state_from_bytes, state_to_bytes
+from vergence_service.jobs.checkpoints import read_checkpoint, write_checkpoint
+from vergence_service.jobs.job import Job, JobOptions
+from vergence_service.jobs.results import read_frames
+from vergence_service.jobs.run import Progress, run_job
 
 FRAMES = 24
 

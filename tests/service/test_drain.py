@@ -19,8 +19,8 @@ from tests.support.models import RecallModel
 from tests.support.server import RawCall, connected, raw_stream, running_server
 from tests.support.status import reason_of
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_service.app import drain
-from vergence_service.transports import PortTaken
+from vergence_service.app.server import drain
+from vergence_service.transports.errors import PortTaken
 
 SERVING = health_pb2.HealthCheckResponse.SERVING
 NOT_SERVING = health_pb2.HealthCheckResponse.NOT_SERVING

@@ -23,12 +23,12 @@ from vergence_proto.errors import (
 )
 from vergence_proto.geometry import Axes, Pose
 from vergence_proto.types import Delivery, DisparityMap, Origin, PoseSample, StereoFrame, StereoRig
-from vergence_service.batcher import StepBatcher
-from vergence_service.continuity import ContinuityLimits
-from vergence_service.engine import DepthEngine
+from vergence_service.inference.batcher import StepBatcher
 from vergence_service.metrics import Metrics
-from vergence_service.stream_table import StreamTable
-from vergence_service.streams import Opening
+from vergence_service.streams.continuity import ContinuityLimits
+from vergence_service.streams.engine import DepthEngine
+from vergence_service.streams.stream import Opening
+from vergence_service.streams.table import StreamTable
 
 OPENING = Opening(StereoRig.from_rectified(RIG))
 

@@ -38,11 +38,11 @@ from tests.support.sequences import (
 )
 from tests.support.server import raw_stream, running_server
 from vergence_proto import codec
+from vergence_proto.datasets import read_disparity_png, read_pfm
 from vergence_proto.errors import ErrorCode
-from vergence_proto.layouts import read_disparity_png, read_pfm
 from vergence_proto.types import Plane
-from vergence_service.model import Step, StepResult
-from vergence_service.transports.http_errors import HTTP_STATUS
+from vergence_service.inference.model import Step, StepResult
+from vergence_service.transports.http.errors import HTTP_STATUS
 
 FRAMES = make_frames(6)
 ARCHIVE = zip_bytes(sequence_files(FRAMES))

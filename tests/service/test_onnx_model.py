@@ -10,23 +10,15 @@ from tests.support.frames import make_frame
 from tests.support.weights_copy import WEIGHTS
 from vergence_proto.errors import NonFinite
 from vergence_proto.geometry import RectifiedRig
-from vergence_service.model import (
-    OnnxStereoModel,
-    RecurrentState,
-    Step,
-    StepResult,
-    View,
-    on_host,
-    packaged_weights_dir,
-    state_bytes,
-)
-from vergence_service.providers import (
+from vergence_service.inference.model import RecurrentState, Step, StepResult, View, state_bytes
+from vergence_service.inference.onnx_model import OnnxStereoModel, on_host, packaged_weights_dir
+from vergence_service.inference.providers import (
     PROVIDERS,
     ProviderUnavailable,
     Resident,
     require_provider,
 )
-from vergence_service.snapshots import state_from_bytes, state_to_bytes
+from vergence_service.inference.snapshots import state_from_bytes, state_to_bytes
 
 # 250 x 130: neither is a multiple of any stride.
 RIG = RectifiedRig(250, 130, 200.0, 200.0, 124.5, 124.5, 64.5, 0.1)

@@ -13,8 +13,8 @@ from tests.support.server import running_server
 from vergence_proto.errors import BadCalibration
 from vergence_proto.geometry import Pose
 from vergence_proto.types import Distortion, Intrinsics, PoseSample, StereoFrame, StereoRig
-from vergence_service.rectify import Rectifier
-from vergence_service.streams import Opening
+from vergence_service.streams.rectify import Rectifier
+from vergence_service.streams.stream import Opening
 
 WIDTH, HEIGHT = 320, 240
 # Toed in, rolled a little, and not quite level.

@@ -16,13 +16,8 @@ from vergence_proto import codec
 from vergence_proto.geometry import RectifiedRig
 from vergence_proto.types import StereoRig
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_service.model import (
-    OnnxStereoModel,
-    RecurrentState,
-    Step,
-    View,
-    packaged_weights_dir,
-)
+from vergence_service.inference.model import RecurrentState, Step, View
+from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
 
 END = pb.StreamDepthRequest(end=pb.End())
 RESET = pb.StreamDepthRequest(reset=pb.Reset())

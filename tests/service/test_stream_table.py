@@ -20,9 +20,9 @@ from vergence_proto.errors import (
 )
 from vergence_proto.types import StereoRig
 from vergence_service.metrics import Metrics
-from vergence_service.rectify import Rectifier
-from vergence_service.stream_table import StreamTable
-from vergence_service.streams import Notice, Opening, Stream
+from vergence_service.streams.rectify import Rectifier
+from vergence_service.streams.stream import Notice, Opening, Stream
+from vergence_service.streams.table import StreamTable
 
 CAPACITY, PER_CLIENT, MEMORY, STATE = 3, 2, 1000, 400
 IDLE_S, NOTICE_S, GRACE_S, TOMBSTONE_S = 60.0, 10.0, 10.0, 300.0

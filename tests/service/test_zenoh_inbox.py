@@ -6,8 +6,8 @@ import pytest
 
 from vergence_proto.errors import Quota
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_proto.zenoh_inbox import Inbox
-from vergence_proto.zenoh_peer import ZenohPeer, make_config
+from vergence_proto.zenoh.inbox import Inbox
+from vergence_proto.zenoh.session import ZenohPeer, make_config
 
 KEY = "vergence/v1/s/frames"
 

@@ -18,12 +18,12 @@ from tests.support.server import running_server
 from tests.support.zenoh_net import address_of, free_endpoint
 from vergence import ConnectionLost, DepthClient
 from vergence_proto.errors import BadShape, UnknownStream
-from vergence_proto.keys import ANY, StreamKeys, ask_key
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_proto.zenoh_inbox import Inbox
-from vergence_proto.zenoh_peer import Answer, ZenohPeer, make_config
-from vergence_service.app import Running
-from vergence_service.transports import ExtraMissing, ZenohUnreachable
+from vergence_proto.zenoh.inbox import Inbox
+from vergence_proto.zenoh.keys import ANY, StreamKeys, ask_key
+from vergence_proto.zenoh.session import Answer, ZenohPeer, make_config
+from vergence_service.app.server import Running
+from vergence_service.transports.errors import ExtraMissing, ZenohUnreachable
 
 NAMESPACE = "vergence"
 KEYS = StreamKeys(NAMESPACE, "s")
@@ -228,8 +228,8 @@ async def test_what_an_operator_can_mend_is_told_in_one_line(
         await refused(zenoh__mode="client", zenoh__connect=[free_endpoint()]).__aenter__()
     with pytest.raises(ZenohUnreachable, match="cannot start Zenoh"):
         await refused(zenoh__config=tmp_path / "missing.json5").__aenter__()
-    monkeypatch.delitem(sys.modules, "vergence_service.transports.zenoh_server")
+    monkeypatch.delitem(sys.modules, "vergence_service.transports.zenoh.server")
     monkeypatch.setitem(sys.modules, "zenoh", None)
-    monkeypatch.delitem(sys.modules, "vergence_proto.zenoh_peer")
+    monkeypatch.delitem(sys.modules, "vergence_proto.zenoh.session")
     with pytest.raises(ExtraMissing, match=r"pip install 'vergence\[zenoh\]'"):
         await refused().__aenter__()

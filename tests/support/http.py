@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.support.server import PATIENCE_S, running_server
-from vergence_service.app import Running
-from vergence_service.model import StereoModel
+from vergence_service.app.server import Running
+from vergence_service.inference.model import StereoModel
 
 ZIP = {"Content-Type": "application/zip"}
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from vergence_proto.errors import NonFinite
 from vergence_proto.model_io import ModelCard, StateTensor
-from vergence_service.model import RecurrentState, Step, StepResult, on_host
+from vergence_service.inference.model import RecurrentState, Step, StepResult
+from vergence_service.inference.onnx_model import on_host
 
 # The value of a left image's first pixel that makes the model fail on it.
 RAISES = 255

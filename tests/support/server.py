@@ -12,8 +12,8 @@ import grpc
 from tests.support.frames import open_message
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.v1 import depth_pb2_grpc
-from vergence_service.app import Running, running
-from vergence_service.model import StereoModel
+from vergence_service.app.server import Running, running
+from vergence_service.inference.model import StereoModel
 from vergence_service.settings import load_settings
 
 PATIENCE_S = 20.0  # a test that hangs fails instead

@@ -14,10 +14,10 @@ from rich.console import Console
 from rich.progress import Progress, TaskID
 from rich.table import Table
 
+from vergence.cli.errors import Trouble
 from vergence.cli.local_server import local_server
 from vergence.cli.play import progress_bar, write_json
 from vergence.cli.sequence_jobs import Job, Query, SequenceService
-from vergence.cli.trouble import Trouble
 from vergence.cli.uploads import Upload, find_uploads
 from vergence_proto.errors import DepthError
 

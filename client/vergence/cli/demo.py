@@ -23,7 +23,7 @@ from vergence.cli.play import (
 from vergence.cli.report import Report
 from vergence.cli.streaming import Answered, every_frame
 from vergence.client import DepthClient
-from vergence_proto.layouts import SourceFrame, StereoSource
+from vergence_proto.datasets import SourceFrame, StereoSource
 from vergence_proto.types import Delivery
 
 _FPS_UNKNOWN = 30.0

@@ -10,7 +10,7 @@ from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager, suppress
 from typing import IO, Literal
 
-from vergence.cli.trouble import Trouble
+from vergence.cli.errors import Trouble
 
 _READY = re.compile(r"listening grpc=(\S+) http=(\S+)")
 _START_TIMEOUT_S = 60.0  # loading and warming a model up takes seconds on a small machine

@@ -16,12 +16,12 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 
+from vergence.cli.errors import Trouble
 from vergence.cli.local_server import local_server
 from vergence.cli.pictures import Row, sheet
 from vergence.cli.streaming import Answered
-from vergence.cli.trouble import Trouble
 from vergence_proto.accuracy import Accuracy, accuracy
-from vergence_proto.layouts import LayoutError, StereoSource, open_source
+from vergence_proto.datasets import LayoutError, StereoSource, open_source
 from vergence_proto.types import Origin
 
 _SHEET_ROWS = 4

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from vergence.cli.errors import Trouble
 from vergence.cli.pictures import Row
 from vergence.cli.play import (
     accuracy_of,
@@ -22,11 +23,10 @@ from vergence.cli.play import (
 )
 from vergence.cli.report import Report
 from vergence.cli.streaming import Answered, every_frame, live_frames
-from vergence.cli.trouble import Trouble
 from vergence.client import DepthClient
 from vergence.session import DepthSession
 from vergence_proto.accuracy import Accuracy
-from vergence_proto.layouts import LayoutError, StereoSource, read_ahead, write_disparity_png
+from vergence_proto.datasets import LayoutError, StereoSource, read_ahead, write_disparity_png
 from vergence_proto.types import Delivery
 
 # Files being written while the next frames are stepped.

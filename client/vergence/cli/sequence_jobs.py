@@ -11,7 +11,7 @@ from typing import Any
 
 import httpx
 
-from vergence.cli.trouble import Trouble
+from vergence.cli.errors import Trouble
 from vergence_proto.errors import DepthError, error_from_wire
 
 # A server that is restarted is back within this.

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from vergence.results import DepthResult
 from vergence.session import DepthSession
-from vergence_proto.layouts import SourceFrame
+from vergence_proto.datasets import SourceFrame
 
 
 @dataclass(frozen=True, slots=True, eq=False)

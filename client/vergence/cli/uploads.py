@@ -5,8 +5,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from vergence.cli.trouble import Trouble
-from vergence_proto.layouts import LAYOUTS, LayoutError, find_sources
+from vergence.cli.errors import Trouble
+from vergence_proto.datasets import LAYOUTS, LayoutError, find_sources
 
 _ARCHIVES = (".zip", ".tar", ".tar.gz", ".tgz", ".tar.xz", ".txz", ".tar.bz2", ".tbz2")
 _OWN_LAYOUT = "vergence"

@@ -8,7 +8,7 @@ from urllib.parse import parse_qs, urlsplit
 
 from vergence.transports.base import Transport
 from vergence.transports.grpc import GrpcTransport
-from vergence_proto.keys import DEFAULT_NAMESPACE
+from vergence_proto.zenoh.keys import DEFAULT_NAMESPACE
 
 _EXPECTED = (
     "expected a server as grpc://HOST:PORT, http://HOST:PORT or "

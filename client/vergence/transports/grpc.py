@@ -11,8 +11,8 @@ from grpc_status import rpc_status
 from vergence.transports.base import Answer, Call, ConnectionLost
 from vergence_proto import codec
 from vergence_proto.errors import DepthError, FrameTooLarge, NotReady
-from vergence_proto.keys import STREAM_ID_METADATA
 from vergence_proto.v1 import depth_pb2 as pb
+from vergence_proto.zenoh.keys import STREAM_ID_METADATA
 
 _SERVICE = "/vergence.v1.DepthService/"
 _ASK_TIMEOUT_S = 10.0

@@ -15,8 +15,8 @@ from vergence_proto.http_records import (
     RecordKind,
     RecordReader,
 )
-from vergence_proto.keys import STREAM_ID_METADATA
 from vergence_proto.v1 import depth_pb2 as pb
+from vergence_proto.zenoh.keys import STREAM_ID_METADATA
 
 _HEADERS = {"Content-Type": PROTOBUF_TYPE}
 # A session pings every second, so even the long answer of a call is never silent for longer.

@@ -10,9 +10,9 @@ from google.protobuf.message import Message
 from vergence.transports.base import Answer, Call, ConnectionLost
 from vergence.transports.zenoh_call import ServerInfos, ZenohCall
 from vergence_proto.errors import DepthError, StreamExpired, UnknownStream
-from vergence_proto.keys import ANY, UNARY_KEYS, ask_key
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_proto.zenoh_peer import ZenohPeer, make_config, reason_of
+from vergence_proto.zenoh.keys import ANY, UNARY_KEYS, ask_key
+from vergence_proto.zenoh.session import ZenohPeer, make_config, reason_of
 
 _ASK_TIMEOUT_S = 1.5  # a server that has not answered by then is as good as none
 _CONNECT_TIMEOUT_MS = 1000

@@ -21,10 +21,10 @@ from vergence_proto.errors import (
     StateMemory,
     StreamLimit,
 )
-from vergence_proto.keys import ANY, OPEN, StreamKeys, ask_key, server_key
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_proto.zenoh_inbox import Inbox
-from vergence_proto.zenoh_peer import Undeclarable, ZenohPeer, reason_of
+from vergence_proto.zenoh.inbox import Inbox
+from vergence_proto.zenoh.keys import ANY, OPEN, StreamKeys, ask_key, server_key
+from vergence_proto.zenoh.session import Undeclarable, ZenohPeer, reason_of
 
 ServerInfos = dict[str, pb.GetServerInfoResponse]  # by server id, best first
 

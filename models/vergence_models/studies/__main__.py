@@ -25,10 +25,9 @@ from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn
 
 from vergence_models.config import ConfigError
 from vergence_models.evaluate import WEIGHTS
-from vergence_models.runs import RunError
 from vergence_models.studies.bench import Bench
-from vergence_models.studies.contenders import gather_contenders, missing_tiers
 from vergence_models.studies.footage import StudySettings, group_on_disk
+from vergence_models.studies.networks import gather_contenders, missing_tiers
 from vergence_models.studies.plan import STUDIES, Study, kitti, on_data
 from vergence_models.studies.plots import draw_plots
 from vergence_models.studies.tables import (
@@ -38,7 +37,8 @@ from vergence_models.studies.tables import (
     read_tables,
     write_tables,
 )
-from vergence_proto.layouts import LayoutError
+from vergence_models.training.runs import RunError
+from vergence_proto.datasets import LayoutError
 from vergence_proto.model_io import ManifestError
 
 log = logging.getLogger("vergence_models.studies")

@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 from rich.progress import Progress
 
-from vergence_models.methods import Method
-from vergence_models.stepping import Footage, View
-from vergence_models.studies.contenders import Contender
+from vergence_models.evaluation.methods import Method
+from vergence_models.evaluation.metric_accumulator import Tally
+from vergence_models.evaluation.stepping import Footage, View
 from vergence_models.studies.footage import Group, StudySettings, clips_at, whole_clips
-from vergence_models.tally import Tally
+from vergence_models.studies.networks import Contender
 from vergence_proto.geometry import RectifiedRig
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 
-from vergence_models.studies.contenders import Contender
+from vergence_models.evaluation.metric_accumulator import Tally
+from vergence_models.studies.networks import Contender
 from vergence_models.studies.tables import Row
-from vergence_models.tally import Tally
 
 PAPER_SETTLED = 15  # frames, at 30 Hz
 GENTLE = 1.05  # noise of one level may cost so much

@@ -14,8 +14,8 @@ from vergence_models.data.generator import GeneratorConfig
 from vergence_models.data.pool import render_pool
 from vergence_models.data.shots import Mix, Playback
 from vergence_models.evaluate import footage_of_pool, footage_on_disk
-from vergence_models.stepping import Footage
-from vergence_proto.layouts import find_sources
+from vergence_models.evaluation.stepping import Footage
+from vergence_proto.datasets import find_sources
 
 SEED = 910_001  # training and validation pools have others
 SPEEDS = (1, 2, 6, 10, 20)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from vergence_models.runs import Validation
 from vergence_models.studies.bench import Bench
 from vergence_models.studies.tables import Curve, Row, Table
+from vergence_models.training.runs import Validation
 
 COLUMNS = {
     "cold_epe": "cold EPE",

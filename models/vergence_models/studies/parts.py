@@ -17,13 +17,12 @@ from rich.progress import track
 
 from vergence_models.config import ConfigError, Kind
 from vergence_models.data.pool import ClipPool
-from vergence_models.layers import ConvexUpsampler
-from vergence_models.lite.network import LiteNetwork
-from vergence_models.runs import RunError, read_run
-from vergence_models.studies.contenders import Training
+from vergence_models.networks.layers import ConvexUpsampler
+from vergence_models.networks.lite.network import LiteNetwork
+from vergence_models.studies.networks import Training
 from vergence_models.studies.tables import Row, Table, markdown, write_tables
-from vergence_models.tiers import trained_network
-from vergence_models.validation import START, validate
+from vergence_models.training.runs import RunError, read_run, trained_network
+from vergence_models.training.validation import START, validate
 
 COLUMNS = {
     f"{kind}_{key}": f"{kind} {label}"

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from vergence_models.evaluate import COLUMNS, figures
-from vergence_models.methods import (
+from vergence_models.evaluation.methods import (
     Method,
     counted_start,
     sgbm_methods,
     with_pose_noise,
     without_poses,
 )
+from vergence_models.evaluation.metric_accumulator import Tally, settled_frame
 from vergence_models.studies import paper
 from vergence_models.studies.bench import Bench, step_times_ms
-from vergence_models.studies.contenders import Contender
 from vergence_models.studies.findings import (
     cold_start_findings,
     loss_pct,
@@ -24,8 +24,8 @@ from vergence_models.studies.findings import (
 )
 from vergence_models.studies.footage import SPEEDS, Group
 from vergence_models.studies.learning import learning_curves
+from vergence_models.studies.networks import Contender
 from vergence_models.studies.tables import EPE_COLUMNS, TIME_COLUMNS, Curve, Row, Table
-from vergence_models.tally import Tally, settled_frame
 
 NOISE_DEG, NOISE_M = 0.3, 0.001  # of one level
 FRAMES_TOLD = (1, 2, 3, 5, 10, 15, 20, 30)

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 from vergence_proto import codec
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_service.border import Answer
 from vergence_service.metrics import Metrics
-from vergence_service.streams import Notice, NoticeKind
+from vergence_service.streams.conversion import Answer
+from vergence_service.streams.stream import Notice, NoticeKind
 
 # One map is encoded and sent while the next is stepped. Past it the stepper waits for the client
 # to read, and newer frames displace older ones in the mailbox.

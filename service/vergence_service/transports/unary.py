@@ -6,7 +6,7 @@ from vergence_proto import codec
 from vergence_proto.instruction_set import instruction_set
 from vergence_proto.model_io import ModelCard
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_service.engine import DepthEngine
+from vergence_service.streams.engine import DepthEngine
 
 
 class UnaryMethods:

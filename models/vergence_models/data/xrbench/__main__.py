@@ -16,7 +16,7 @@ from vergence_models.data.xrbench.recipe import KINDS, SETS, BadRecipe, Recipe
 from vergence_models.data.xrbench.sheet import contact_sheet
 from vergence_models.data.xrbench.tracer import VARIANTS, NoRenderer
 from vergence_models.data.xrbench.writer import PASSES, encode_png, render_sequence
-from vergence_proto.layouts import LayoutError
+from vergence_proto.datasets import LayoutError
 
 
 def _option(field: str, text: str) -> typer.models.OptionInfo:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vergence_models.data.xrbench.writer import PASSES
-from vergence_proto.layouts import read_image, read_pfm
+from vergence_proto.datasets import read_image, read_pfm
 
 Image = NDArray[np.uint8]  # [H, W, 3], RGB
 

@@ -36,7 +36,7 @@ from vergence_models.data.xrbench import truths
 from vergence_models.data.xrbench.camera import Eye, FrameTruth, StereoCamera
 from vergence_models.data.xrbench.meshes import Matrix
 from vergence_models.data.xrbench.recipe import BadRecipe, Recipe
-from vergence_proto.layouts import encode_pfm
+from vergence_proto.datasets import encode_pfm
 
 PASSES = ("clean", "final")
 _BLENDER_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])

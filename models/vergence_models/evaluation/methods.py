@@ -1,0 +1,97 @@
+"""The contestants of evaluation and studies: whatever turns footage into disparity.
+
+A method has a name and may be told something else than the truth about the camera's motion.
+"""
+
+from __future__ import annotations
+
+import itertools
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vergence_models.data.trajectories import rotation
+from vergence_models.evaluation.sgbm import sgbm_disparity
+from vergence_models.evaluation.stepping import Footage, Prediction, SteppedNetwork
+from vergence_proto.geometry import Pose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Method:
+    """Predicts a sequence frame by frame; the label is unique among those compared."""
+
+    label: str
+    predict: Callable[[Footage], Iterator[Prediction]]
+
+    def told(self, what: str, change: Callable[[Footage], Footage]) -> Method:
+        """The same method, shown changed footage."""
+        return Method(f"{self.label}, {what}", lambda footage: self.predict(change(footage)))
+
+
+def counted(iterations: int) -> str:
+    return f"{iterations} iteration{'s' if iterations > 1 else ''}"
+
+
+def counted_start(network: SteppedNetwork, iterations: int) -> str:
+    closer = ", the last ones a closer look" if network.looks_closer(iterations) else ""
+    return counted(iterations) + closer
+
+
+def warm_method(network: SteppedNetwork, name: str, iterations: int, *, cold: int) -> Method:
+    """Carries its state; ``cold`` iterations on the first frame."""
+    return Method(
+        f"{name}, warm, {counted(iterations)}",
+        lambda footage: network.sequence(footage, cold=cold, warm=iterations),
+    )
+
+
+def single_frame_method(network: SteppedNetwork, name: str, iterations: int) -> Method:
+    """Forgets its state after every frame."""
+    return Method(
+        f"{name}, every frame cold, {counted_start(network, iterations)}",
+        lambda footage: network.sequence(footage, cold=iterations, warm=None),
+    )
+
+
+def sgbm_method(label: str, scale: float) -> Method:
+    def predict(footage: Footage) -> Iterator[Prediction]:
+        limit = 192 if len(footage.views) == 1 and footage.rig.width > 700 else 128
+        for view in footage.views:
+            found = sgbm_disparity(view.left, view.right, max_disparity_px=limit, scale=scale)
+            yield Prediction(found)
+
+    return Method(label, predict)
+
+
+def sgbm_methods() -> list[Method]:
+    return [sgbm_method("SGBM, full size", 1.0), sgbm_method("SGBM, half size", 0.5)]
+
+
+def without_poses(footage: Footage) -> Footage:
+    """The network is told that nothing moves, so its state stays where it was."""
+    return replace(footage, views=[replace(v, world_from_left=None) for v in footage.views])
+
+
+def with_pose_noise(footage: Footage, *, deg: float, m: float) -> Footage:
+    """The network is told motions that are off by just so much, from each frame to the next.
+
+    The axis and the direction of each error are random, and the same whatever its size. Footage
+    without poses stays as it is.
+    """
+    poses = [view.world_from_left for view in footage.views]
+    if not (deg or m) or any(pose is None for pose in poses):
+        return footage
+    known = [pose for pose in poses if pose is not None]
+    random = np.random.default_rng(zlib.crc32(footage.name.encode()))
+    told = known[:1]
+    for before, now in itertools.pairwise(known):
+        axis, direction = (v / np.linalg.norm(v) for v in random.standard_normal((2, 3)))
+        curr_from_true = Pose(rotation(axis * np.radians(deg)), direction * m)
+        prev_from_curr = before.inverse() @ now
+        told.append(told[-1] @ prev_from_curr @ curr_from_true.inverse())
+    views = [
+        replace(view, world_from_left=pose) for view, pose in zip(footage.views, told, strict=True)
+    ]
+    return replace(footage, views=views)

@@ -1,0 +1,95 @@
+"""What every tier's network is: one step of the recurrence, from two images and a state to both.
+
+The tiers differ in what they compute and in what they remember, never in how they are called; so
+training, validation, export and parity checks know this module alone.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Generic, NamedTuple, TypeAlias, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from vergence_models.config import NetworkConfig
+from vergence_proto.model_io import StateTensor
+
+# What one step hands to the next, float32 [B, C, H/s, W/s] each, as ``state_tensors`` tells; all
+# zeros is a cold start. A tier may name its parts in a NamedTuple of its own.
+State: TypeAlias = tuple[Tensor, ...]
+
+ConfigT = TypeVar("ConfigT", bound=NetworkConfig, covariant=True)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate(ABC):
+    """What one step answers; a tier adds the inner estimates that its training supervises too."""
+
+    disparity: Tensor  # float32 [B, H, W], px > 0
+    sigma: Tensor  # float32 [B, H, W], px: half of the errors lie within sigma ln 2
+
+    @abstractmethod
+    def loss(self, truth_px: Tensor, max_disparity_px: int) -> Tensor:
+        """The loss of this step against ``truth_px`` [B, H, W] (0 = unknown), a scalar."""
+
+
+class Found(NamedTuple):
+    """What a step gives to whoever has no use for more: the outputs of an exported graph."""
+
+    disparity: Tensor  # float32 [B, H, W], px
+    sigma: Tensor  # likewise
+    state: State
+
+
+class StereoNetwork(nn.Module, ABC, Generic[ConfigT]):
+    """The whole step. ``iterations`` is an argument: the weights are the same for every count."""
+
+    def __init__(self, config: ConfigT) -> None:
+        super().__init__()
+        self.config = config
+
+    @property
+    @abstractmethod
+    def state_tensors(self) -> tuple[StateTensor, ...]:
+        """The recurrent state as the contract names it, in the order of the state itself."""
+
+    @abstractmethod
+    def forward(
+        self,
+        left: Tensor,
+        right: Tensor,
+        uvd_curr_from_prev: Tensor,
+        state: State,
+        iterations: int,
+    ) -> tuple[Estimate, State]:
+        """One step. ``left`` and ``right`` uint8 [B, H, W, 3]; H and W multiples of the stride."""
+
+    def cold_step(self, left: Tensor, right: Tensor, iterations: int, *, closer: int = 0) -> Found:
+        """A step that knows of no frame before, the last ``closer`` iterations at twice the size.
+
+        Raises ValueError if the tier takes no closer look and is asked for one.
+        """
+        batch, height, width, _ = left.shape
+        still = torch.eye(4, device=left.device).repeat(batch, 1, 1)
+        nothing = self.cold_state(batch, height, width)
+        estimate, state = self(left, right, still, nothing, iterations - closer)
+        found = Found(estimate.disparity, estimate.sigma, state)
+        return self.closer_look(left, right, found, closer) if closer else found
+
+    def closer_look(self, left: Tensor, right: Tensor, found: Found, iterations: int) -> Found:
+        """What more iterations at twice the size make of what was ``found`` in a step's images."""
+        raise ValueError(f"{type(self).__name__} takes no closer look, got {iterations} iterations")
+
+    def cold_state(self, batch: int, height: int, width: int) -> State:
+        """The state that knows nothing, for images of that size, where the weights are."""
+        device = next(self.parameters()).device
+        return tuple(
+            torch.zeros(batch, *tensor.shape(height, width), device=device)
+            for tensor in self.state_tensors
+        )
+
+
+# Callers need no more than the fields that all configurations share.
+AnyNetwork: TypeAlias = StereoNetwork[NetworkConfig]

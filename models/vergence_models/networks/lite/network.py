@@ -1,0 +1,208 @@
+"""The network of `lite`: a wide coarse search, a narrow fine one, and time to join them.
+
+The wide search is coarse (every disparity, cells of 1/8), the narrow one fine (a handful of
+hypotheses per cell of 1/4); time joins them: the previous disparity, moved to the new view, is what
+the wide search starts from, and what the answer of the narrow one is blended with where they agree.
+Choosing and blending is learned; matching itself starts from fixed census descriptors, so the
+untrained network is already a stereo matcher.
+
+An iteration is all that depends on what is expected: both choices and the recurrent cell. The next
+iteration expects its answer, as the next frame does; so a second one is what seeing the same frame
+again would be, and a network that improves over frames improves over iterations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from vergence_models.config import LiteNetworkConfig
+from vergence_models.networks.base import Estimate, Found, State, StereoNetwork
+from vergence_models.networks.cost_volume import whole_rows
+from vergence_models.networks.layers import CensusDescriptor, added, all_pairs, banded
+from vergence_models.networks.lite.coarse import (
+    BIN_PX,
+    Clues,
+    CoarseUpdate,
+    CostFilter,
+    extremes,
+    peak,
+    smooth_fill,
+)
+from vergence_models.networks.lite.context import Context
+from vergence_models.networks.lite.hypotheses import Hypotheses
+from vergence_models.networks.lite.losses import search_cross_entropy
+from vergence_models.networks.lite.refinement import Refined, Refinement, near_columns
+from vergence_models.networks.lite.upscaled import joined, larger_image, larger_state
+from vergence_models.networks.losses import known, masked_mean, output_loss, robust
+from vergence_models.networks.warp import warp_state
+from vergence_proto.model_io import StateTensor
+
+
+class LiteState(NamedTuple):
+    """What one step hands to the next, and within it one iteration to the next."""
+
+    disparity: Tensor  # float32 [B, 1, H/4, W/4], full-resolution pixels, 0 = nothing known
+    hidden: Tensor  # float32 [B, C, H/8, W/8]
+
+
+class Evidence(NamedTuple):
+    """What two images say by themselves: made once, whatever the iterations."""
+
+    clues: Clues
+    pairs: Tensor  # at 1/4, see Near.pairs
+    context4: Tensor  # [B, C, H/4, W/4]
+    context8: Tensor
+    context16: Tensor  # as the cost filter takes it
+
+
+class Guess(NamedTuple):
+    """What an iteration found at one scale, and what it chose among."""
+
+    disparity: Tensor  # [B, 1, H/scale, W/scale] px
+    hypotheses: Hypotheses
+    scale: int
+
+    def loss(self, truth_px: Tensor, max_disparity_px: int) -> Tensor:
+        truth = truth_px[:, None, self.scale // 2 :: self.scale, self.scale // 2 :: self.scale]
+        error = robust((self.disparity - truth).abs())
+        unlikely = self.hypotheses.unlikelihood(truth_px, max_disparity_px, scale=self.scale)
+        return 0.3 * masked_mean(error, known(truth, max_disparity_px)) + 0.3 * unlikely
+
+
+class Iteration(NamedTuple):
+    """What one iteration found."""
+
+    answer: Refined
+    hidden: Tensor  # [B, C, H/8, W/8]
+    scores: Tensor  # of the wide search, as in LiteEstimate
+    guesses: tuple[Guess, Guess]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LiteEstimate(Estimate):
+    """The answer, and the guesses on the way to it."""
+
+    coarse_scores: Tensor  # [B, H/8, W/8, D]: unnormalised log-probability, largest disparity first
+    guesses: list[Guess]  # at both scales, of each iteration
+
+    def loss(self, truth_px: Tensor, max_disparity_px: int) -> Tensor:
+        """Of the answer, its sigma, both scales on the way, and the coarse scores themselves."""
+        loss = output_loss(self.disparity, self.sigma, truth_px, max_disparity_px)
+        losses = [guess.loss(truth_px, max_disparity_px) for guess in self.guesses]
+        loss = loss + 2 / len(losses) * added(losses)
+        search = search_cross_entropy(self.coarse_scores, truth_px, max_disparity_px, bin_px=BIN_PX)
+        return loss + 0.2 * search
+
+
+class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
+    """The step of `lite`."""
+
+    def __init__(self, config: LiteNetworkConfig) -> None:
+        super().__init__(config)
+        self.fine_descriptor = CensusDescriptor(config.fine_bits, contrast=4.0)
+        self.coarse_descriptor = CensusDescriptor(config.coarse_bits, contrast=3.0)
+        self.context = Context(config)
+        self.cost_filter = CostFilter(config)
+        self.update = CoarseUpdate(config)
+        self.refinement = Refinement(config)
+        self.near = near_columns(config.max_disparity_px)
+        self.bins = config.max_disparity_px // BIN_PX
+
+    @property
+    def state_tensors(self) -> tuple[StateTensor, ...]:
+        return (StateTensor("disparity", 1, 4), StateTensor("hidden_0", self.config.hidden, 8))
+
+    def forward(
+        self,
+        left: Tensor,
+        right: Tensor,
+        uvd_curr_from_prev: Tensor,
+        state: State,
+        iterations: int,
+    ) -> tuple[LiteEstimate, LiteState]:
+        following = self.moved(LiteState(*state), uvd_curr_from_prev)
+        return self.iterated(self.search(left, right), following, iterations)
+
+    def closer_look(self, left: Tensor, right: Tensor, found: Found, iterations: int) -> Found:
+        search = self.search(larger_image(left), larger_image(right))
+        state = LiteState(*larger_state(*found.state))
+        estimate, state = self.iterated(search, state, iterations)
+        closer = Found(estimate.disparity, estimate.sigma, state)
+        return joined(found, closer, self.config.max_disparity_px)
+
+    def iterated(
+        self, evidence: Evidence, state: LiteState, iterations: int
+    ) -> tuple[LiteEstimate, LiteState]:
+        """The answer after so many iterations, from a state in the view of this frame."""
+        guesses: list[Guess] = []
+        for _ in range(iterations):
+            found = self.iterate(evidence, state)
+            state = LiteState(found.answer.disparity, found.hidden)
+            guesses += found.guesses
+        disparity, sigma = self.refinement.enlarged(found.answer)
+        return LiteEstimate(disparity, sigma, found.scores, guesses), state
+
+    def moved(self, state: LiteState, uvd_curr_from_prev: Tensor) -> LiteState:
+        """The state of the previous frame in the view of this one."""
+        return LiteState(*warp_state(*state, uvd_curr_from_prev, scale=4, hidden_scale=8))
+
+    def search(self, left: Tensor, right: Tensor) -> Evidence:
+        """What the images say by themselves; [B, H, W, 3] uint8 each."""
+        return Evidence(self.search_wide(left, right), *self.search_narrow(left, right))
+
+    def search_wide(self, left: Tensor, right: Tensor) -> Clues:
+        """All disparities, at 1/8."""
+        pairs = all_pairs(
+            self.coarse_descriptor(gray(left, 4), 2), self.coarse_descriptor(gray(right, 4), 1)
+        )
+        return self.cost_filter.clues(banded(pairs, self.bins))
+
+    def search_narrow(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Pairs at 1/4, and the context: what :class:`Evidence` holds besides the clues."""
+        left_fine = self.fine_descriptor(gray(left, 2), 2)
+        right_fine = self.fine_descriptor(gray(right, 2), 1)
+        quarter, eighth, sixteenth = self.context(left)
+        pairs = self.near.pairs(left_fine, right_fine)
+        return pairs, quarter, eighth, self.cost_filter.context(sixteenth)
+
+    def iterate(self, evidence: Evidence, state: LiteState) -> Iteration:
+        """From the surface that is expected to a better one, by both searches."""
+        prior, hidden = state
+        seen = (prior > 0).to(prior.dtype)
+        seen8 = F.avg_pool2d(seen, 2)
+        hole8 = (seen8 <= 0).to(prior.dtype)
+        prior8 = F.avg_pool2d(prior, 2) / seen8.clamp(min=0.1)
+        scores = whole_rows(self.cost_filter(evidence.clues, evidence.context16, prior8))
+        guess = peak(scores)
+        confidence = torch.exp(4 * guess[1])
+        fill = smooth_fill(guess[0], confidence)
+        hidden, d, hypotheses = self.update(
+            hidden,
+            prior8 + hole8 * (fill - prior8),
+            guess=guess,
+            fills=torch.cat((fill, extremes(guess[0], confidence, fill)), dim=1),
+            hole=hole8,
+            scores=scores,
+            context=evidence.context8,
+        )
+        pairs = self.near.volume(evidence.pairs)
+        answer, chosen_among = self.refinement(pairs, d, hidden, prior, evidence.context4)
+        guesses = Guess(d, hypotheses, 8), Guess(answer.disparity, chosen_among, 4)
+        return Iteration(answer, hidden, scores.scores, guesses)
+
+
+def gray(image: Tensor, scale: int) -> Tensor:
+    """Mean of the colours of blocks of pixels: uint8 [B, H, W, 3] to [B, 1, H/scale, W/scale].
+
+    Two rows speak for a block. Their sums are a product with ones: of bytes, that is quick.
+    """
+    batch, height, width, _ = image.shape
+    ones = torch.eye(32 // scale, device=image.device).repeat_interleave(3 * scale, dim=0)
+    rows = image[:, :: scale // 2].reshape(-1, 96)  # widths are multiples of 32
+    sums = torch.matmul(rows.float(), ones).view(batch, height // scale, 2, width // scale)
+    return sums.sum(dim=2)[:, None] * (1 / (6 * scale))

@@ -1,0 +1,60 @@
+"""A closer look: the last iterations of a cold start, taken at twice the size.
+
+Most of what a lone frame gets wrong is smaller than the cells that it was matched in. The same
+weights see images of twice the size in cells of half the size, and start from what was found
+before. Four times the work is worth it where there is no past, and too much in every frame.
+
+No training knows of it: 2,000 steps with a closer look at a fifth of the cold frames made 3 % fewer
+pixels off by more than 1 px in it, and 2 % more off by more than 2 px.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from vergence_models.networks.base import Found
+from vergence_models.networks.layers import enlarge
+
+MARGIN_PX = 4.0  # of the largest disparity that a search finds well
+ELSEWHERE_PX = 16.0  # two cells of the wide search
+# Errors do not halve with the pixels: with this, half of them lie within sigma ln 2 on held-out
+# clips; with 0.5 it would be 40 %.
+SIGMA_SCALE = 0.7
+
+
+def larger_image(image: Tensor) -> Tensor:
+    """Twice the size, bilinear: uint8 [B, H, W, 3]."""
+    planes = image.permute(0, 3, 1, 2).float()
+    larger = F.interpolate(planes, scale_factor=2.0, mode="bilinear", align_corners=False)
+    return torch.floor(larger + 0.5).to(torch.uint8).permute(0, 2, 3, 1)
+
+
+def larger_state(disparity: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
+    """A state as images of twice the size would have left it."""
+    return 2 * enlarge(disparity), enlarge(hidden)
+
+
+def joined(plain: Found, closer: Found, max_disparity_px: int) -> Found:
+    """The closer look at the size of the plain one, which stays where it is more to be trusted.
+
+    That is of what is too near for a search that ends at half of the disparities, and where the
+    closer look is elsewhere and less sure of it: on a blank wall it sees less of what is around.
+    """
+    disparity, sigma = 0.5 * halved(closer.disparity), SIGMA_SCALE * halved(closer.sigma)
+    elsewhere = (disparity - plain.disparity).abs() > ELSEWHERE_PX
+    kept = elsewhere & (sigma > plain.sigma)
+    kept = kept | (plain.disparity > max_disparity_px / 2 - MARGIN_PX)
+    (before, _), (after, hidden) = plain.state, closer.state
+    kept_cells = kept[:, None, 2::4, 2::4]
+    return Found(
+        torch.where(kept, plain.disparity, disparity),
+        torch.where(kept, plain.sigma, sigma),
+        (torch.where(kept_cells, before, 0.5 * halved(after)), halved(hidden)),
+    )
+
+
+def halved(values: Tensor) -> Tensor:
+    """Half the size, the mean of blocks of 2x2: [B, H, W] or [B, C, H, W]."""
+    return F.avg_pool2d(values, 2)

@@ -1,0 +1,159 @@
+"""The step of `lite` in the parts that its graphs are stitched from."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from vergence_models.networks.base import Found
+from vergence_models.networks.lite.coarse import Clues
+from vergence_models.networks.lite.network import Evidence, LiteNetwork, LiteState
+from vergence_models.networks.lite.refinement import Refined
+from vergence_models.networks.lite.upscaled import joined, larger_image, larger_state
+from vergence_models.onnx_export.modules import (
+    BATCH,
+    COLUMNS,
+    ROWS,
+    Part,
+    PartOf,
+    Sizes,
+    cells,
+    step_input_names,
+    step_inputs,
+    step_output_names,
+)
+from vergence_models.onnx_export.stitch import PLAIN, TAKES_PLACE, CloserLook, Parts
+from vergence_proto.model_io import LEFT, RIGHT
+
+NARROW = ("pairs", "context4", "context8", "context16")
+GIVEN = (*Clues._fields, *NARROW)
+
+
+class Wide(PartOf[LiteNetwork]):
+    """The wide search, and the state moved to the new view."""
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        left, right, matrix, *state = inputs
+        moved = self.network.moved(LiteState(*state), matrix)
+        return *self.network.search_wide(left, right), *moved
+
+
+class Narrow(PartOf[LiteNetwork]):
+    """The narrow search's volume, and the context. It takes about as long as the other."""
+
+    def forward(self, *images: Tensor) -> tuple[Tensor, ...]:
+        left, right = images
+        return self.network.search_narrow(left, right)
+
+
+class Iterate(PartOf[LiteNetwork]):
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        fixed, features, *narrow = inputs[: len(GIVEN)]
+        evidence = Evidence(Clues(fixed, features), *narrow)
+        found = self.network.iterate(evidence, LiteState(*inputs[len(GIVEN) :]))
+        disparity, doubt, features = found.answer
+        return disparity, found.hidden, doubt, features
+
+
+class End(PartOf[LiteNetwork]):
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        disparity, hidden, doubt, features = inputs
+        refined = Refined(disparity, doubt, features)
+        return *self.network.refinement.enlarged(refined), disparity, hidden
+
+
+class Enter(PartOf[LiteNetwork]):
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        left, right, *state = inputs
+        return larger_image(left), larger_image(right), *larger_state(*state)
+
+
+class Join(PartOf[LiteNetwork]):
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        plain, closer = (
+            Found(disparity, sigma, tuple(state))
+            for disparity, sigma, *state in (inputs[:4], inputs[4:])
+        )
+        disparity, sigma, state = joined(plain, closer, self.network.config.max_disparity_px)
+        return disparity, sigma, *state
+
+
+def parts_of(network: LiteNetwork) -> Parts[Part]:
+    """Both searches, one iteration, and the way to full size."""
+    stride = network.config.stride
+    inputs, sizes = step_inputs(network)
+    columns = network.near
+    window = columns.ratio * COLUMNS + columns.ratio * (columns.before + columns.after)
+    moving = tuple(f"at_{name}" for name in LiteState._fields)  # outputs have the plain names
+    sizes_of: dict[str, Sizes] = {
+        "fixed": cells(stride, 8),
+        "features": {**cells(stride, 16), 0: network.bins * BATCH},
+        "pairs": {0: BATCH, 1: stride // 4 * ROWS, 3: window, 4: stride // 32 * COLUMNS},
+        "context4": cells(stride, 4),
+        "context8": cells(stride, 8),
+        "context16": cells(stride, 16),
+        "at_disparity": cells(stride, 4),
+        "at_hidden": cells(stride, 8),
+    }
+    wide, narrow = Wide(network), Narrow(network)
+    clues = wide.examples(*inputs)
+    found = narrow.examples(*inputs[:2])
+    between = (*clues[:2], *found, *clues[2:])
+    iterate = Iterate(network)
+    answer = iterate.examples(*between)
+    return Parts(
+        begin=(
+            Part(wide, inputs, sizes, step_input_names(network), (*Clues._fields, *moving)),
+            Part(narrow, inputs[:2], sizes[:2], (LEFT, RIGHT), NARROW),
+        ),
+        iterate=Part(
+            iterate,
+            between,
+            tuple(sizes_of[name] for name in (*GIVEN, *moving)),
+            (*GIVEN, *moving),
+            tuple(TAKES_PLACE + name for name in (*moving, "doubt", "features4")),
+        ),
+        end=Part(
+            End(network),
+            answer,
+            tuple(cells(stride, scale) for scale in (4, 8, 4, 4)),
+            (*moving, "doubt", "features4"),
+            step_output_names(network),
+        ),
+        closer=closer_look(network),
+    )
+
+
+def closer_look(network: LiteNetwork) -> CloserLook[Part]:
+    """The way to twice the size and back."""
+    (left, right, _, *state), (image, *_) = step_inputs(network)
+    given, outputs = step_input_names(network), step_output_names(network)
+    enter, (height, width) = Enter(network), left.shape[1:3]
+    larger = enter.examples(left, right, *state)
+    maps = [torch.zeros(2, height, width) for _ in range(2)]
+    larger_maps = [torch.zeros(2, 2 * height, 2 * width) for _ in range(2)]
+    stride = network.config.stride
+    sizes, larger_sizes = (found_sizes(rows) for rows in (stride, 2 * stride))
+    return CloserLook(
+        enter=Part(
+            enter,
+            (left, right, *state),
+            (image, image, *sizes[2:]),
+            (LEFT, RIGHT, *outputs[2:]),
+            tuple(TAKES_PLACE + name for name in (LEFT, RIGHT, *given[3:])),
+        ),
+        moved=dict(zip(given[3:], (f"at_{name}" for name in LiteState._fields), strict=True)),
+        join=Part(
+            Join(network),
+            (*maps, *state, *larger_maps, *larger[2:]),
+            (*sizes, *larger_sizes),
+            (*(PLAIN + name for name in outputs), *outputs),
+            tuple(TAKES_PLACE + name for name in outputs),
+        ),
+    )
+
+
+def found_sizes(stride: int) -> tuple[Sizes, ...]:
+    """Of what a step finds in images that are multiples of ``stride``."""
+    plane: Sizes = {0: BATCH, 1: stride * ROWS, 2: stride * COLUMNS}
+    return plane, plane, cells(stride, 4), cells(stride, 8)

@@ -1,0 +1,59 @@
+"""The step of `full` and `fast` in the three parts that their graphs are stitched from."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from vergence_models.networks.raft.network import RaftGiven, RaftNetwork, RaftState
+from vergence_models.networks.raft.update import CELL_PX, pyramid
+from vergence_models.onnx_export.modules import (
+    BATCH,
+    COLUMNS,
+    ROWS,
+    Part,
+    PartOf,
+    Sizes,
+    cells,
+    step_input_names,
+    step_inputs,
+    step_output_names,
+)
+from vergence_models.onnx_export.stitch import TAKES_PLACE, Parts
+
+
+class Begin(PartOf[RaftNetwork]):
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        left, right, matrix, *state = inputs
+        _, given, moving = self.network.begin(left, right, matrix, RaftState(*state))
+        return *given, *moving
+
+
+class Iterate(PartOf[RaftNetwork]):
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        given, moving = RaftGiven(*inputs[:3]), RaftState(*inputs[3:])
+        # Every iteration makes the pyramid anew; onnxruntime drops the repetitions.
+        return self.network.iterate(given, pyramid(given.pairs), moving)
+
+
+class End(PartOf[RaftNetwork]):
+    def forward(self, *moving: Tensor) -> tuple[Tensor, ...]:
+        disparity, sigma, following = self.network.end(RaftState(*moving))
+        return disparity, sigma, *following
+
+
+def parts_of(network: RaftNetwork) -> Parts[Part]:
+    """What comes before the iterations, one of them, and what comes after."""
+    given, moving = RaftGiven._fields, tuple(f"at_{name}" for name in RaftState._fields)
+    moved = tuple(TAKES_PLACE + name for name in moving)
+    stride, cell = network.config.stride, network.config.stride // CELL_PX
+    pairs: Sizes = {0: BATCH, 1: cell * ROWS, 2: cell * COLUMNS, 3: cell * COLUMNS}
+    eighth, sixteenth = cells(stride, CELL_PX), cells(stride, 2 * CELL_PX)
+    given_sizes, moving_sizes = (pairs, eighth, sixteenth), (eighth, eighth, sixteenth)
+    inputs, sizes = step_inputs(network)
+    begin = Begin(network)
+    between = begin.examples(*inputs)
+    return Parts(
+        (Part(begin, inputs, sizes, step_input_names(network), given + moving),),
+        Part(Iterate(network), between, given_sizes + moving_sizes, given + moving, moved),
+        Part(End(network), between[3:], moving_sizes, moving, step_output_names(network)),
+    )

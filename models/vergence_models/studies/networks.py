@@ -1,0 +1,148 @@
+"""The networks to study: exported graphs, and training runs where no graph is."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from vergence_models.evaluation.methods import Method, single_frame_method, warm_method
+from vergence_models.evaluation.stepping import OnnxNetwork, SteppedNetwork
+from vergence_models.evaluation.torch_stepping import TorchNetwork
+from vergence_models.training.runs import Run, Validation, read_run
+from vergence_proto.model_io import MANIFEST_NAME, ManifestError
+
+TIERS = ("full", "fast", "lite")
+WARM = (1, 2, 5)  # the counts the paper tabulates
+SINGLE_FRAME = (7, 20)
+COLD = 8  # iterations on the first frame of a warm sequence, at most
+
+
+@dataclass(frozen=True, slots=True)
+class Training:
+    """How far a network was trained: what every figure of it must be read with."""
+
+    name: str
+    runtime: str
+    frames: int  # seen, repeated ones counted again
+    minutes: float
+    device: str
+
+    @classmethod
+    def of(cls, name: str, runtime: str, story: dict[str, Any]) -> Training:
+        """``story``: any JSON, as a run tells it and a manifest repeats it."""
+        return cls(
+            name,
+            runtime,
+            int(story.get("frames", 0)),
+            round(float(story.get("minutes", 0.0)), 1),
+            str(story.get("device", "unknown")),
+        )
+
+    @property
+    def words(self) -> str:
+        return (
+            f"{self.name}: {self.frames:,} frames seen in {self.minutes:g} minutes on "
+            f"{self.device}; run by {self.runtime}"
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Contender:
+    """A network, and the iteration counts it is studied at."""
+
+    name: str
+    network: SteppedNetwork
+    training: Training
+    warm: tuple[int, ...]
+    single_frame: tuple[int, ...]
+    cold: int  # iterations on the first frame of a warm sequence
+    warps: bool  # its state moves with the camera; otherwise poses do not matter to it
+    history: list[Validation] = field(default_factory=list)  # of a run, while it was trained
+
+    @property
+    def tier(self) -> str:
+        return self.network.card.name
+
+    def warm_methods(self) -> list[Method]:
+        return [warm_method(self.network, self.name, n, cold=self.cold) for n in self.warm]
+
+    def single_frame_methods(self) -> list[Method]:
+        return [single_frame_method(self.network, self.name, n) for n in self.single_frame]
+
+    def started_with(self, cold: int) -> Method:
+        """One warm iteration a frame, after ``cold`` iterations on the first."""
+        method = warm_method(self.network, self.name, 1, cold=cold)
+        return replace(method, label=f"{method.label}, {cold} on the first frame")
+
+
+def exported(folder: Path, *, threads: int) -> list[Contender]:
+    """Every model of a folder of weights. Raises ManifestError."""
+    path = folder / MANIFEST_NAME
+    try:
+        entries: dict[str, Any] = json.loads(path.read_text("utf-8"))["models"]
+    except FileNotFoundError:
+        raise ManifestError(f"no manifest at {path}; export a model there first") from None
+    except (json.JSONDecodeError, KeyError) as error:
+        raise ManifestError(f"{path}: expected a manifest of models: {error!r}") from None
+    found = []
+    for name, entry in entries.items():
+        network = OnnxNetwork(folder, name, threads=threads)
+        counts = network.card.graphs
+        found.append(
+            Contender(
+                name,
+                network,
+                Training.of(name, "onnxruntime", entry.get("training", {})),
+                warm=tuple(n for n in WARM if n in counts),
+                single_frame=tuple(n for n in SINGLE_FRAME if n in counts) or (max(counts),),
+                cold=network.card.iterations_at_most(COLD),
+                warps=entry.get("architecture", {}).get("warp", True),
+            )
+        )
+    return found
+
+
+def trained(run: Run, beside: Iterable[Contender], *, threads: int) -> Contender:
+    """A training run, for the counts that no exported graph of its name has."""
+    tier = run.config_name
+    same = [other for other in beside if other.tier == tier]
+    name = f"{tier} (PyTorch)"
+    return Contender(
+        name,
+        TorchNetwork(run, threads=threads),
+        Training.of(name, "PyTorch", run.story),
+        warm=tuple(n for n in WARM if all(n not in other.warm for other in same)),
+        single_frame=tuple(
+            n for n in SINGLE_FRAME if all(n not in other.single_frame for other in same)
+        ),
+        cold=COLD,
+        warps=dataclasses.asdict(run.network).get("warp", True),
+        history=run.history,
+    )
+
+
+def gather_contenders(weights: list[Path], runs: list[Path], *, threads: int) -> list[Contender]:
+    """All of them, ordered by tier; a model in two folders is taken from the first.
+
+    Raises ManifestError, RunError, ConfigError.
+    """
+    found: dict[str, Contender] = {}
+    read = [read_run(folder) for folder in runs]  # quick to fail, graphs are slow to load
+    for folder in weights:
+        for contender in exported(folder, threads=threads):
+            found.setdefault(contender.name, contender)
+    for run in read:
+        contender = trained(run, list(found.values()), threads=threads)
+        found.setdefault(contender.name, contender)
+    order = {name: place for place, name in enumerate(TIERS)}
+    return sorted(found.values(), key=lambda c: (order.get(c.tier, len(order)), c.name))
+
+
+def missing_tiers(contenders: Iterable[Contender]) -> list[str]:
+    """Tiers that nothing was given for."""
+    there = {contender.tier for contender in contenders}
+    return [tier for tier in TIERS if tier not in there]

@@ -1,0 +1,97 @@
+"""KITTI stereo 2012 and 2015: lone pairs with LiDAR truth.
+
+``kitti2012:ROOT/training/000046`` and ``kitti2015:ROOT/training/000046``: the number is that of
+the files, no folder of the name exists::
+
+    2012  image_0 image_1/%06d_10.png   disp_occ disp_noc/%06d_10.png
+          calib/%06d.txt                P0: P1:
+    2015  image_2 image_3/%06d_10.png   disp_occ_0 disp_noc_0/%06d_10.png
+          calib_cam_to_cam/%06d.txt     P_rect_02: P_rect_03:
+
+Of 2012 the grey images are read, because its truth is that of the grey cameras. The testing half
+has no truth.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from vergence_proto.datasets.images import read_disparity_png, read_image
+from vergence_proto.datasets.kitti import read_projections, rig_from_projections
+from vergence_proto.datasets.source import FrameFiles, StereoSource, Truth
+
+
+@dataclass(frozen=True, slots=True)
+class _Edition:
+    left: str
+    right: str
+    calib: str
+    label: str
+    cameras: tuple[int, int]
+    truth: str
+    visible_truth: str
+
+
+_2012 = _Edition("image_0", "image_1", "calib", "P{}:", (0, 1), "disp_occ", "disp_noc")
+_2015 = _Edition(
+    "image_2",
+    "image_3",
+    "calib_cam_to_cam",
+    "P_rect_0{}:",
+    (2, 3),
+    "disp_occ_0",
+    "disp_noc_0",
+)
+
+
+def find_2012(root: Path) -> list[Path]:
+    """Every pair in or under ``root``."""
+    return _find(root, _2012)
+
+
+def find_2015(root: Path) -> list[Path]:
+    """Every pair in or under ``root``."""
+    return _find(root, _2015)
+
+
+def open_2012(path: Path) -> StereoSource:
+    """Raises LayoutError: a file is missing or wrong."""
+    return _open(path, _2012)
+
+
+def open_2015(path: Path) -> StereoSource:
+    """Raises LayoutError: a file is missing or wrong."""
+    return _open(path, _2015)
+
+
+def _find(root: Path, edition: _Edition) -> list[Path]:
+    images = root.rglob(f"{edition.left}/*_10.png")
+    return sorted(image.parent.parent / image.stem.removesuffix("_10") for image in images)
+
+
+def _open(path: Path, edition: _Edition) -> StereoSource:
+    split, name = path.parent, f"{path.name}_10.png"
+    calib = split / edition.calib / f"{path.name}.txt"
+    left = split / edition.left / name
+    height, width = read_image(left).shape[:2]
+    projections = read_projections(calib, edition.label, edition.cameras)
+    truth = split / edition.truth / name
+    pair = FrameFiles(
+        left,
+        split / edition.right / name,
+        capture_ns=0,
+        read_truth=partial(_truth, truth, split / edition.visible_truth / name)
+        if truth.exists()
+        else None,
+    )
+    rig = rig_from_projections(calib, projections, (width, height))
+    return StereoSource(path.name, rig, None, [pair])
+
+
+def _truth(path: Path, visible_path: Path) -> Truth:
+    visible = None
+    if visible_path.exists():
+        visible = np.isfinite(read_disparity_png(visible_path))
+    return Truth(read_disparity_png(path), visible=visible)

@@ -1,0 +1,84 @@
+"""Middlebury 2014 and 2021, and MiddEval3: ``middlebury:ROOT/Motorcycle-perfect``.
+
+::
+
+    im0.png im1.png
+    calib.txt                     cam0=[f 0 cx; 0 f cy; 0 0 1], doffs, baseline (mm), width, height
+    disp0.pfm or disp0GT.pfm      pixel offset u_left - u_right; +inf unknown
+    mask0nocc.png                 MiddEval3: 255 seen by both, 128 occluded, 0 unknown
+
+Z = f * baseline / (d + doffs), where doffs = cx1 - cx0.
+"""
+
+import re
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from vergence_proto.datasets.files import LayoutError, numbers, read_text
+from vergence_proto.datasets.images import read_pfm, read_stored_png
+from vergence_proto.datasets.source import FrameFiles, StereoSource, Truth, rectified_rig
+from vergence_proto.types import StereoRig
+
+_MM_PER_M = 1000.0
+_VISIBLE = 255
+
+
+def find(root: Path) -> list[Path]:
+    """Every scene in or under ``root``."""
+    return sorted(
+        path.parent for path in root.rglob("calib.txt") if (path.parent / "im0.png").exists()
+    )
+
+
+def open_path(path: Path) -> StereoSource:
+    """Raises LayoutError: a file is missing or wrong."""
+    return open_scene(path, truth_folder=path)
+
+
+def open_scene(path: Path, *, truth_folder: Path) -> StereoSource:
+    """Raises LayoutError: a file is missing or wrong."""
+    names = (truth_folder / name for name in ("disp0.pfm", "disp0GT.pfm"))
+    truth = next((each for each in names if each.exists()), None)
+    pair = FrameFiles(
+        path / "im0.png",
+        path / "im1.png",
+        capture_ns=0,
+        read_truth=partial(_truth, truth, truth_folder / "mask0nocc.png") if truth else None,
+    )
+    return StereoSource(path.name, _rig(path / "calib.txt"), None, [pair])
+
+
+def _rig(path: Path) -> StereoRig:
+    text = read_text(path, "Middlebury's calibration")
+    values = dict(line.split("=", 1) for line in text.splitlines() if "=" in line)
+    for key in ("cam0", "baseline", "width", "height"):
+        if key not in values:
+            raise LayoutError(f"{path}: expected a line {key}=..., found none")
+
+    def number(key: str) -> float:
+        return numbers(values[key], 1, f"{path}, {key}")[0]
+
+    words = re.sub(r"[\[\];]", " ", values["cam0"])
+    f, _, cx, _, fy, cy, *_ = numbers(words, 9, f"{path}, cam0")
+    return rectified_rig(
+        path,
+        (int(number("width")), int(number("height"))),
+        fx=f,
+        fy=fy,
+        cx=cx,
+        cx_right=cx + (number("doffs") if "doffs" in values else 0.0),
+        cy=cy,
+        baseline_m=number("baseline") / _MM_PER_M,
+    )
+
+
+def _truth(path: Path, mask_path: Path) -> Truth:
+    offset_px = read_pfm(path)
+    if not mask_path.exists():
+        return Truth(offset_px)
+    mask = read_stored_png(mask_path)
+    if mask.ndim != 2:
+        raise LayoutError(f"{mask_path}: expected a grey PNG, got {list(mask.shape)}")
+    return Truth(offset_px, visible=np.asarray(mask == _VISIBLE))

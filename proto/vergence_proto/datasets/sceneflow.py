@@ -1,0 +1,144 @@
+"""SceneFlow (FlyingThings3D, Driving, Monkaa) and what was rendered in its format (XR-Stereo).
+
+``sceneflow:ROOT/frames_finalpass/TRAIN/A/0000``, with ``?fx=PIXELS`` for images that are neither
+SceneFlow's own 960x540 nor come with their intrinsics, as our benchmark's do::
+
+    ROOT/frames_cleanpass|frames_finalpass/REST/left right   %04d.png or .webp
+    ROOT/disparity/REST/left                                 %04d.pfm, positive pixels
+    ROOT/camera_data/REST/camera_data.txt                    "Frame N", then L and R: 4x4 a line
+
+Camera-to-world matrices have Blender's camera axes: x right, y up, z back. The world stays
+Blender's. SceneFlow states lengths in units of its own.
+"""
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from vergence_proto.datasets.files import (
+    LayoutError,
+    numbers,
+    object_number,
+    read_object,
+    read_text,
+)
+from vergence_proto.datasets.images import read_image, read_pfm
+from vergence_proto.datasets.poses import checked_pose
+from vergence_proto.datasets.source import (
+    FrameFiles,
+    StereoSource,
+    Truth,
+    nominal_ns,
+    rectified_rig,
+)
+from vergence_proto.geometry import Pose
+
+_PASSES = ("frames_cleanpass", "frames_finalpass")
+_IMAGES = (".png", ".webp", ".jpg")
+_OWN_SIZE = (960, 540)
+_OWN_FX = 1050.0  # a 35 mm lens
+_OWN_FX_WIDE = {"15mm_focallength": 450.0}  # part of Driving
+_OPENCV_FROM_BLENDER_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def find(root: Path) -> list[Path]:
+    """Every sequence in or under ``root``, of either pass."""
+    folders = sorted(left.parent for left in root.rglob("left") if left.is_dir())
+    return [folder for folder in folders if any(part in _PASSES for part in folder.parts)]
+
+
+def open_path(path: Path, *, fx: float | None = None) -> StereoSource:
+    """Raises LayoutError: a file is missing or wrong, or ``fx`` (pixels) is needed and not given.
+
+    Frames that the camera data leaves out have no pose.
+    """
+    disparity, specular = (_beside(path, kind) / "left" for kind in ("disparity", "specular"))
+    origin = _beside(path, "camera_data") / "camera_data.txt"
+    cameras = _read_cameras(origin)
+    images = sorted(
+        each
+        for each in (path / "left").glob("*")
+        if each.suffix in _IMAGES and each.stem.isdecimal()
+    )
+    if not images:
+        raise LayoutError(f"{path / 'left'}: expected images %04d.png or .webp, found none")
+    height, width = read_image(images[0]).shape[:2]
+    own = (width, height) == _OWN_SIZE
+    fps = None
+    intrinsics = origin.with_name("intrinsics.json")
+    if intrinsics.exists():
+        known = read_object(intrinsics, "fx and fps")
+        fx = fx or object_number(intrinsics, known, "fx")
+        fps = object_number(intrinsics, known, "fps")
+        if fps <= 0:
+            raise LayoutError(f"{intrinsics}: expected a positive fps, got {fps}")
+        own = False
+    if fx is None and not own:
+        raise LayoutError(
+            f"{path}: images of {width}x{height} are not SceneFlow's own, and the layout states "
+            f"no focal length; add it: sceneflow:{path}?fx=PIXELS"
+        )
+    first_left, first_right = next(iter(cameras.values()))
+    rig = rectified_rig(
+        origin,
+        (width, height),
+        fx=_own_fx(path) if fx is None else fx,
+        cx=(width - 1) / 2,
+        cy=(height - 1) / 2,
+        baseline_m=(first_left.inverse() @ first_right).translation_m[0],
+    )
+    files = [
+        FrameFiles(
+            left,
+            path / "right" / left.name,
+            nominal_ns(index, fps),
+            cameras[int(left.stem)][0] if int(left.stem) in cameras else None,
+            partial(_truth, disparity / f"{left.stem}.pfm", specular / f"{left.stem}.png")
+            if disparity.is_dir()
+            else None,
+        )
+        for index, left in enumerate(images)
+    ]
+    return StereoSource(path.name, rig, fps, files, metric=not own)
+
+
+def _beside(path: Path, kind: str) -> Path:
+    """The folder of another kind of data for the same sequence."""
+    for index, part in enumerate(path.parts):
+        if part in _PASSES:
+            return Path(*path.parts[:index], kind, *path.parts[index + 1 :])
+    raise LayoutError(f"{path}: expected a sequence under {' or '.join(_PASSES)}")
+
+
+def _own_fx(path: Path) -> float:
+    return next((_OWN_FX_WIDE[part] for part in path.parts if part in _OWN_FX_WIDE), _OWN_FX)
+
+
+def _read_cameras(path: Path) -> Mapping[int, tuple[Pose, Pose]]:
+    """Frame number -> world_from_left, world_from_right, OpenCV camera axes."""
+    cameras: dict[int, tuple[Pose, Pose]] = {}
+    blocks = read_text(path, "SceneFlow's camera data").split("Frame")[1:]
+    for block in blocks:
+        lines = [line.split(maxsplit=1) for line in block.splitlines() if line.strip()]
+        if [line[0] for line in lines[1:]] != ["L", "R"] or not lines[0][0].isdecimal():
+            raise LayoutError(f"{path}: expected 'Frame N', 'L ...', 'R ...', got {block[:60]!r}")
+        number = int(lines[0][0])
+        left, right = (_pose(line[-1], f"{path}, frame {number}") for line in lines[1:])
+        cameras[number] = left, right
+    if not cameras:
+        raise LayoutError(f"{path}: expected blocks of 'Frame N', found none")
+    return cameras
+
+
+def _pose(words: str, origin: str) -> Pose:
+    world_from_blender = np.reshape(numbers(words, 16, origin), (4, 4))
+    return checked_pose(world_from_blender @ _OPENCV_FROM_BLENDER_CAMERA, origin)
+
+
+def _truth(path: Path, specular: Path) -> Truth:
+    offset_px = read_pfm(path)
+    offset_px[~(offset_px > 0)] = np.nan
+    mask = read_image(specular)[..., 0] == 0 if specular.is_file() else None
+    return Truth(offset_px, mask)

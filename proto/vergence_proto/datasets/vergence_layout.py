@@ -1,0 +1,180 @@
+"""The project's own layout: a folder with one rectified sequence, or one pair.
+
+::
+
+    calib.json                      fx, fy, cx, cy, baseline_m, width, height (and, where they
+                                    differ, cx_right; and fps)
+    frame_0000_left.EXT             png, webp or jpg; numbered from 0 without a gap
+    frame_0000_right.EXT
+    poses.txt                       optional: one 3x4 camera-to-world matrix a line, left camera,
+                                    OpenCV axes, metres
+    frame_0000_gt.npz               optional truth: disp uint16 = round(64 * px), 0 unknown; vis and
+                                    nonspecular, np.packbits(axis=1) masks
+    frame_0000_ref.npz              or a sparse reference: u, v, disp
+
+A pair has ``left.EXT``, ``right.EXT`` and, for truth, ``gt.npz`` with disp float32, NaN unknown.
+Disparities are pixel offsets u_left - u_right. Null intrinsics mean unknown: a nominal camera, as
+wide as its focal length (53 degrees) with a baseline of 0.1 m, stands in for disparity's sake.
+"""
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vergence_proto.datasets.files import (
+    JsonObject,
+    LayoutError,
+    npz_arrays,
+    object_number,
+    read_object,
+)
+from vergence_proto.datasets.poses import read_matrix_poses
+from vergence_proto.datasets.source import (
+    FrameFiles,
+    StereoSource,
+    Truth,
+    nominal_ns,
+    rectified_rig,
+)
+from vergence_proto.types import Plane, StereoRig
+
+_EXTENSIONS = (".png", ".webp", ".jpg")
+_TRUTH_STEPS_PER_PX = np.float32(64)
+_NOMINAL_BASELINE_M = 0.1
+
+
+def find(root: Path) -> list[Path]:
+    """Every sequence and pair in or under ``root``."""
+    return sorted(path.parent for path in root.rglob("calib.json") if _has_images(path.parent))
+
+
+def open_path(path: Path) -> StereoSource:
+    """Raises LayoutError: a file is missing or wrong; calibration and poses are read at once."""
+    origin = path / "calib.json"
+    calib = read_object(origin, "the calibration of a vergence: sequence or pair")
+    rig, metric = _rig(origin, calib)
+    if _image(path / "left"):
+        return StereoSource(path.name, rig, None, [_pair(path)], metric)
+    fps = object_number(origin, calib, "fps") if calib.get("fps") is not None else None
+    if fps is not None and fps <= 0:
+        raise LayoutError(f"{origin}: expected a positive fps, got {fps}")
+    return StereoSource(path.name, rig, fps, _frames(path, rig, fps), metric)
+
+
+def _has_images(path: Path) -> bool:
+    return bool(_image(path / "left") or _image(path / "frame_0000_left"))
+
+
+def _image(stem: Path) -> Path | None:
+    candidates = (stem.with_name(stem.name + extension) for extension in _EXTENSIONS)
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def _image_or_raise(stem: Path) -> Path:
+    found = _image(stem)
+    if found is None:
+        raise LayoutError(f"{stem}: not found as {' or '.join(_EXTENSIONS)}")
+    return found
+
+
+def _rig(path: Path, calib: JsonObject) -> tuple[StereoRig, bool]:
+    width, height = (int(object_number(path, calib, key)) for key in ("width", "height"))
+    if calib.get("fx", 0) is None or calib.get("baseline_m", 0) is None:
+        centre = (width - 1) / 2, (height - 1) / 2
+        nominal = {"fx": width, "cx": centre[0], "cy": centre[1], "baseline_m": _NOMINAL_BASELINE_M}
+        return rectified_rig(path, (width, height), **nominal), False
+    known = {key: object_number(path, calib, key) for key in ("fx", "cx", "cy", "baseline_m")}
+    extra = {key: object_number(path, calib, key) for key in ("fy", "cx_right") if key in calib}
+    return rectified_rig(path, (width, height), **known, **extra), True
+
+
+def _pair(path: Path) -> FrameFiles:
+    truth = path / "gt.npz"
+    return FrameFiles(
+        _image_or_raise(path / "left"),
+        _image_or_raise(path / "right"),
+        capture_ns=0,
+        read_truth=partial(_pair_truth, truth) if truth.exists() else None,
+    )
+
+
+def _frames(path: Path, rig: StereoRig, fps: float | None) -> list[FrameFiles]:
+    stems = {each.stem for each in path.glob("frame_*_left.*")}
+    if not stems:
+        raise LayoutError(f"{path}: expected frame_0000_left and on, or left and right; found none")
+    count = len(stems)
+    missing = next((k for k in range(count) if f"frame_{k:04d}_left" not in stems), None)
+    if missing is not None:  # a gap is an error and not an early end
+        raise LayoutError(f"{path}/frame_{missing:04d}_left: not found, but later frames are there")
+    trajectory = path / "poses.txt"
+    poses = read_matrix_poses(trajectory) if trajectory.exists() else [None] * count
+    if len(poses) != count:
+        raise LayoutError(f"{trajectory}: expected {count} poses, one a frame, got {len(poses)}")
+    frames = []
+    for index, world_from_left in enumerate(poses):
+        stem = path / f"frame_{index:04d}"
+        dense, sparse = Path(f"{stem}_gt.npz"), Path(f"{stem}_ref.npz")
+        read_truth = None
+        if dense.exists():
+            read_truth = partial(_dense_truth, dense)
+        elif sparse.exists():
+            read_truth = partial(_sparse_truth, sparse, (rig.left.height, rig.left.width))
+        frames.append(
+            FrameFiles(
+                _image_or_raise(Path(f"{stem}_left")),
+                _image_or_raise(Path(f"{stem}_right")),
+                nominal_ns(index, fps),
+                world_from_left,
+                read_truth,
+            )
+        )
+    return frames
+
+
+def _pair_truth(path: Path) -> Truth:
+    offset_px: Plane = npz_arrays(path, "disp")["disp"].astype(np.float32)
+    offset_px[~(np.isfinite(offset_px) & (offset_px > 0))] = np.nan
+    return Truth(offset_px)
+
+
+def _dense_truth(path: Path) -> Truth:
+    arrays = npz_arrays(path, "disp")
+    stored = arrays["disp"]
+    if stored.dtype != np.uint16 or stored.ndim != 2:
+        raise LayoutError(f"{path}: expected disp as uint16 [H, W], got {stored.dtype}")
+    offset_px = stored / _TRUTH_STEPS_PER_PX
+    offset_px[stored == 0] = np.nan
+    return Truth(
+        offset_px.astype(np.float32),
+        mask=_unpacked(path, arrays, "nonspecular", stored.shape),
+        visible=_unpacked(path, arrays, "vis", stored.shape),
+    )
+
+
+def _unpacked(
+    path: Path, arrays: Mapping[str, NDArray[np.generic]], name: str, shape: tuple[int, ...]
+) -> NDArray[np.bool_] | None:
+    if name not in arrays:
+        return None
+    height, width = shape
+    packed = arrays[name]
+    if packed.dtype != np.uint8 or packed.shape != (height, -(-width // 8)):
+        raise LayoutError(
+            f"{path}: expected {name} as np.packbits(axis=1) of {width}x{height}, "
+            f"got {packed.dtype} {list(packed.shape)}"
+        )
+    return np.unpackbits(packed.astype(np.uint8), axis=1, count=width).astype(np.bool_)
+
+
+def _sparse_truth(path: Path, shape: tuple[int, int]) -> Truth:
+    arrays = npz_arrays(path, "u", "v", "disp")
+    u, v = np.rint(arrays["u"]).astype(int), np.rint(arrays["v"]).astype(int)
+    if not u.shape == v.shape == arrays["disp"].shape:
+        raise LayoutError(f"{path}: expected u, v and disp of one length")
+    inside = (u >= 0) & (v >= 0) & (u < shape[1]) & (v < shape[0])
+    offset_px = np.full(shape, np.nan, np.float32)
+    offset_px[v[inside], u[inside]] = arrays["disp"][inside]
+    return Truth(offset_px)

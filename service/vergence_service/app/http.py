@@ -1,0 +1,110 @@
+"""The composition of the HTTP face: jobs on disk, routes, and the server that offers them."""
+
+import asyncio
+import logging
+import os
+from collections.abc import AsyncIterator, Callable
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+
+from prometheus_client import CollectorRegistry
+
+from vergence_service.jobs.archives import ArchiveLimits
+from vergence_service.jobs.queue import JobQueue, QueueLimits
+from vergence_service.jobs.store import JobStore, StoreUnavailable
+from vergence_service.settings import Settings
+from vergence_service.streams.engine import DepthEngine
+from vergence_service.transports.http.app import HttpServer, make_http_app
+from vergence_service.transports.http.pairs import pair_routes
+from vergence_service.transports.http.sequences import no_sequence_routes, sequence_routes
+from vergence_service.transports.http.streams import stream_routes
+from vergence_service.transports.http.uploads import UploadLimits
+from vergence_service.transports.open_calls import OpenCalls
+from vergence_service.transports.unary import UnaryMethods
+
+log = logging.getLogger(__name__)
+
+_MIB = 1 << 20
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HttpFace:
+    server: HttpServer
+    start_jobs: Callable[[], None]  # once the model is there
+
+
+@asynccontextmanager
+async def serving_http(
+    settings: Settings,
+    engine: DepthEngine,
+    unary: UnaryMethods,
+    calls: OpenCalls,
+    registry: CollectorRegistry,
+) -> AsyncIterator[HttpFace]:
+    """Listen and answer, to the end of the block. Raises PortTaken."""
+    batch = settings.batch
+    archive = ArchiveLimits(
+        max_files=batch.max_files,
+        max_unpacked_bytes=batch.max_unpacked_mib * _MIB,
+        max_ratio=batch.max_ratio,
+    )
+    upload = UploadLimits(
+        max_bytes=batch.max_upload_mib * _MIB, idle_s=batch.idle_s, archive=archive
+    )
+    pair = UploadLimits(
+        max_bytes=2 * settings.grpc.max_frame_mib * _MIB,
+        idle_s=batch.idle_s,
+        archive=replace(archive, max_files=2),
+    )
+    stopping = asyncio.Event()
+    async with AsyncExitStack() as stack:
+        routes = [pair_routes(engine, limits=pair), stream_routes(calls, unary)]
+        start: Callable[[], None]
+        try:
+            store = stack.enter_context(JobStore(batch.directory or _default_jobs_directory()))
+        except StoreUnavailable as error:
+            # Live depth is worth serving without a disk.
+            log.warning("sequences are not taken: %s", error)
+            routes.append(no_sequence_routes(str(error)))
+            start = _nothing
+        else:
+            queue = await stack.enter_async_context(
+                JobQueue(
+                    engine,
+                    store,
+                    limits=QueueLimits(
+                        waiting=batch.waiting,
+                        waiting_per_client=batch.waiting_per_client,
+                        checkpoint_s=batch.checkpoint_s,
+                        keep_s=batch.keep_h * 3600,
+                        disk_bytes=batch.disk_mib * _MIB,
+                    ),
+                )
+            )
+            routes.append(
+                sequence_routes(queue, model=engine.card.name, limits=upload, stopping=stopping)
+            )
+            start = queue.start
+        app = make_http_app(
+            version=version("vergence"),
+            ready=lambda: engine.ready,
+            registry=registry,
+            routes=routes,
+        )
+        server = await stack.enter_async_context(
+            HttpServer(
+                app, calls, host=settings.http.host, port=settings.http.port, stopping=stopping
+            )
+        )
+        yield HttpFace(server, start)
+
+
+def _nothing() -> None:
+    """No jobs are to be started."""
+
+
+def _default_jobs_directory() -> Path:
+    state = os.environ.get("XDG_STATE_HOME")
+    return (Path(state) if state else Path.home() / ".local" / "state") / "vergence" / "batch"

@@ -1,0 +1,171 @@
+"""The composition root: settings in, a running server out."""
+
+import asyncio
+import signal
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, closing
+from dataclasses import dataclass
+
+from prometheus_client import CollectorRegistry
+
+from vergence_proto.types import Delivery
+from vergence_service.app.http import serving_http
+from vergence_service.app.zenoh import ZenohFace, on_zenoh
+from vergence_service.inference.batcher import StepBatcher
+from vergence_service.inference.model import StereoModel
+from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
+from vergence_service.metrics import Metrics
+from vergence_service.settings import Settings
+from vergence_service.streams.continuity import ContinuityLimits
+from vergence_service.streams.engine import DepthEngine
+from vergence_service.streams.table import StreamTable
+from vergence_service.transports.addresses import place
+from vergence_service.transports.grpc.server import DepthServicer, GrpcServer
+from vergence_service.transports.http.app import HttpServer
+from vergence_service.transports.open_calls import OpenCalls
+from vergence_service.transports.stream_call import StreamLimits
+from vergence_service.transports.unary import UnaryMethods
+
+_MIB = 1 << 20
+_SWEEP_EVERY_S = 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Running:
+    """A server that serves."""
+
+    grpc_address: str
+    http_address: str
+    engine: DepthEngine
+    grpc: GrpcServer
+    http: HttpServer
+    zenoh: ZenohFace | None
+
+
+def make_model(settings: Settings) -> OnnxStereoModel:
+    """Raises ManifestError, ProviderUnavailable, FileNotFoundError: no such weights here."""
+    return OnnxStereoModel(
+        settings.model.weights or packaged_weights_dir(),
+        settings.model.name,
+        providers=settings.model.providers,
+        threads=settings.model.threads,
+        allow_spinning=settings.model.allow_spinning,
+    )
+
+
+@asynccontextmanager
+async def running(
+    settings: Settings, model: StereoModel, *, clock: Callable[[], float] = time.monotonic
+) -> AsyncIterator[Running]:
+    """A server from its first listening socket to its last; inside the block it serves.
+
+    Raises PortTaken, ExtraMissing, ZenohUnreachable, and what the model raises when it loads.
+    """
+    registry = CollectorRegistry()
+    metrics = Metrics(registry)
+    streams = StreamTable(
+        capacity=settings.streams.capacity,
+        per_client=settings.streams.per_client,
+        max_state_bytes=settings.streams.max_state_mib * _MIB,
+        idle_timeout_s=settings.streams.idle_timeout_s,
+        idle_notice_s=settings.streams.idle_notice_s,
+        detach_grace_s=settings.streams.detach_grace_s,
+        clock=clock,
+        metrics=metrics,
+    )
+    batcher = StepBatcher(model, max_batch=settings.model.max_batch, clock=clock, metrics=metrics)
+    engine = DepthEngine(
+        streams,
+        batcher,
+        card=model.card,
+        iterations=settings.model.iterations,
+        cold_iterations={
+            Delivery.NEWEST: settings.model.cold_iterations,
+            Delivery.EVERY: settings.model.cold_iterations_every,
+        },
+        limits=ContinuityLimits(**settings.continuity.model_dump()),
+        max_pixels=settings.streams.max_pixels,
+        clock=clock,
+        metrics=metrics,
+    )
+    max_frame_bytes = settings.grpc.max_frame_mib * _MIB
+    limits = StreamLimits(
+        credit=settings.grpc.credit,
+        waiting_frames=settings.grpc.waiting_frames,
+        max_frame_bytes=max_frame_bytes,
+    )
+    unary = UnaryMethods(
+        engine,
+        computed_by=model.engine,
+        provider=model.provider,
+        max_frame_bytes=max_frame_bytes,
+    )
+
+    def open_calls() -> OpenCalls:
+        return OpenCalls(engine, limits=limits, clock=clock)
+
+    # Outermost ends last: no transport outlives the batcher that it feeds.
+    async with (
+        batcher,
+        GrpcServer(
+            DepthServicer(unary, open_calls()),
+            host=settings.grpc.host,
+            port=settings.grpc.port,
+            max_frame_bytes=max_frame_bytes,
+        ) as grpc_server,
+        serving_http(settings, engine, unary, open_calls(), registry) as http,
+        on_zenoh(settings, unary, open_calls()) as zenoh,
+        _sweeping(streams),
+    ):
+        await engine.start()
+        http.start_jobs()
+        await grpc_server.serving()
+        if zenoh is not None:
+            await zenoh.server.serving()
+        yield Running(
+            place(settings.grpc.host, grpc_server.port),
+            place(settings.http.host, http.server.port),
+            engine,
+            grpc_server,
+            http.server,
+            zenoh,
+        )
+
+
+async def serve(settings: Settings, *, on_serving: Callable[[Running], None]) -> None:
+    """Serve until SIGTERM or SIGINT, then drain. Raises as make_model and running."""
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop.set)
+    with closing(make_model(settings)) as model:
+        async with running(settings, model) as server:
+            on_serving(server)
+            await stop.wait()
+            await drain(server, within_s=settings.grpc.drain_s)
+
+
+async def drain(server: Running, *, within_s: float) -> None:
+    """Tell clients, let them leave, answer what they have sent; within twice the time given."""
+    server.engine.drain(within_s=within_s)
+    async with asyncio.TaskGroup() as tasks:
+        tasks.create_task(server.grpc.drain(within_s=within_s))
+        tasks.create_task(server.http.drain(within_s=within_s))
+        if server.zenoh is not None:
+            tasks.create_task(server.zenoh.server.drain(within_s=within_s))
+
+
+@asynccontextmanager
+async def _sweeping(streams: StreamTable) -> AsyncIterator[None]:
+    async def sweep() -> None:
+        while True:
+            await asyncio.sleep(_SWEEP_EVERY_S)
+            streams.sweep()
+
+    task = asyncio.create_task(sweep(), name="sweep")
+    try:
+        yield
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)

@@ -1,0 +1,51 @@
+"""The composition of the Zenoh face, if it is wanted: where it is found, and what answers there."""
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from vergence_service.settings import Settings
+from vergence_service.transports.addresses import place
+from vergence_service.transports.errors import ExtraMissing
+from vergence_service.transports.open_calls import OpenCalls
+from vergence_service.transports.unary import UnaryMethods
+
+if TYPE_CHECKING:  # Zenoh is an extra
+    from vergence_service.transports.zenoh.server import ZenohServer
+
+_ROUTER_PORT = 7447  # by custom
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ZenohFace:
+    server: "ZenohServer"
+    endpoint: str  # where clients find it, or the file that says so
+
+
+@asynccontextmanager
+async def on_zenoh(
+    settings: Settings, unary: UnaryMethods, calls: OpenCalls
+) -> AsyncIterator[ZenohFace | None]:
+    """On the network to the end of the block. Raises ExtraMissing, ZenohUnreachable."""
+    chosen = settings.zenoh
+    if not chosen.enabled:
+        yield None
+        return
+    try:
+        from vergence_service.transports.zenoh.server import ZenohServer, zenoh_config
+    except ImportError:
+        raise ExtraMissing("Zenoh", "zenoh") from None
+    listen = list(chosen.listen)
+    if chosen.mode == "router" and not listen:
+        listen = [f"tcp/{place(settings.grpc.host, _ROUTER_PORT)}"]
+    config = zenoh_config(
+        chosen.config,
+        mode=chosen.mode,
+        listen=listen,
+        connect=chosen.connect,
+        max_frame_bytes=calls.limits.max_frame_bytes,
+    )
+    endpoint = str(chosen.config or ",".join(listen or chosen.connect))
+    async with ZenohServer(unary, calls, config=config, namespace=chosen.namespace) as server:
+        yield ZenohFace(server, endpoint)

@@ -1,0 +1,160 @@
+"""A network that takes steps as ONNX graphs in onnxruntime."""
+
+import importlib.util
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vergence_proto.errors import NonFinite
+from vergence_proto.model_io import (
+    DISPARITY,
+    LEFT,
+    RIGHT,
+    SIGMA,
+    UVD_CURR_FROM_PREV,
+    ModelCard,
+    load_model_card,
+)
+from vergence_service.inference.graphs import StagedGraphs
+from vergence_service.inference.model import RecurrentState, Step, StepResult
+from vergence_service.inference.providers import (
+    ENGINE,
+    Resident,
+    Tensor,
+    device_of,
+    require_provider,
+)
+
+
+class OnnxStereoModel:
+    """A model of the manifest under onnxruntime.
+
+    States stay where the first provider computes them; ``states_on`` names another device.
+    ``threads`` are those of its steps together, 0 for one a core. Raises ManifestError (see
+    :func:`vergence_proto.model_io.load_model_card`) and ProviderUnavailable.
+    """
+
+    def __init__(
+        self,
+        weights_dir: Path,
+        name: str,
+        *,
+        providers: Sequence[str],
+        threads: int,
+        allow_spinning: bool,
+        states_on: str | None = None,
+    ) -> None:
+        self._card = load_model_card(weights_dir, name)
+        self._provider = require_provider(providers[0])
+        self._device = states_on or device_of(providers[0])
+        self._graphs = StagedGraphs(
+            self._card,
+            providers=[require_provider(provider) for provider in providers],
+            threads=threads,
+            allow_spinning=allow_spinning,
+            device=self._device,
+        )
+
+    @property
+    def card(self) -> ModelCard:
+        return self._card
+
+    @property
+    def provider(self) -> str:
+        return self._provider
+
+    @property
+    def engine(self) -> str:
+        return ENGINE
+
+    @property
+    def lanes(self) -> int:
+        return self._graphs.lanes if self._device is None else 1
+
+    def warm_up(self, iterations: int, *cold_iterations: int) -> None:
+        self._graphs.load(iterations)
+        for count in cold_iterations:
+            self._graphs.load(count, cold_pixels=0)
+
+    def close(self) -> None:
+        """End the threads that steps use; none may follow."""
+        self._graphs.close()
+
+    def step(self, steps: Sequence[Step]) -> list[StepResult]:
+        # Row by row where a batch gains nothing: a CPU's kernels sum in an order that depends on
+        # the batch, and a stream's answer must not depend on its neighbours.
+        if self._device is None:
+            return [result for step in steps for result in self._step([step])]
+        return self._step(steps)
+
+    def _step(self, steps: Sequence[Step]) -> list[StepResult]:
+        height, width = steps[0].view.left.shape[:2]
+        pixels = math.prod(self._card.step_size(height, width)) if steps[0].cold else None
+        found = self._graphs.run(steps[0].iterations, self._feeds(steps), cold_pixels=pixels)
+        # What is not finite in a state that stays shows in the maps of the next step.
+        to_check = [values for values in found.values() if not isinstance(values, Resident)]
+        if not all(np.isfinite(values).all() for values in to_check):
+            raise NonFinite("the network's result was not finite; the stream starts anew")
+        disparity, sigma = _batch_on_host(found[DISPARITY]), _batch_on_host(found[SIGMA])
+        states = _rows([found[tensor.output_name] for tensor in self._card.state], len(steps))
+        return [
+            StepResult(
+                disparity[row, :height, :width],
+                sigma[row, :height, :width],
+                RecurrentState.after(step.view, step.state, states[row]),
+            )
+            for row, step in enumerate(steps)
+        ]
+
+    def _feeds(self, steps: Sequence[Step]) -> dict[str, NDArray[np.generic] | Resident]:
+        left = _stack([self._card.grown(step.view.left) for step in steps])
+        feeds: dict[str, NDArray[np.generic] | Resident] = {
+            LEFT: left,
+            RIGHT: _stack([self._card.grown(step.view.right) for step in steps]),
+            UVD_CURR_FROM_PREV: _stack([step.uvd_curr_from_prev for step in steps]),
+        }
+        for index, tensor in enumerate(self._card.state):
+            nothing = np.zeros(tensor.shape(*left.shape[1:3]), np.float32)
+            before = [step.state.tensors[index] if step.state else nothing for step in steps]
+            feeds[tensor.input_name] = (
+                before[0]
+                if len(before) == 1 and isinstance(before[0], Resident)
+                else _stack([*map(on_host, before)])
+            )
+        return feeds
+
+
+def on_host(tensor: Tensor) -> NDArray[np.float32]:
+    """[C, h, w], wherever it was."""
+    return tensor.on_host()[0] if isinstance(tensor, Resident) else tensor
+
+
+def _batch_on_host(tensor: Tensor) -> NDArray[np.float32]:
+    return tensor.on_host() if isinstance(tensor, Resident) else tensor
+
+
+def _rows(tensors: Sequence[Tensor], count: int) -> list[tuple[Tensor, ...]]:
+    """The states of the rows of a batch. A lone one stays where it is, several go to the host."""
+    if count == 1 and isinstance(tensors[0], Resident):
+        return [tuple(tensors)]
+    batches = [*map(_batch_on_host, tensors)]
+    return [tuple(batch[row] for batch in batches) for row in range(count)]
+
+
+def packaged_weights_dir() -> Path:
+    """The weights that were installed with the project, found without importing their package.
+
+    Raises FileNotFoundError if they were not.
+    """
+    spec = importlib.util.find_spec("vergence_models")
+    if spec is None or not spec.submodule_search_locations:
+        raise FileNotFoundError("no weights are installed; give a folder that has a manifest.json")
+    return Path(next(iter(spec.submodule_search_locations))) / "weights"
+
+
+def _stack(rows: Sequence[NDArray[np.generic]]) -> NDArray[np.generic]:
+    """A batch of rows; a single one is not copied."""
+    return np.ascontiguousarray(rows[0])[None] if len(rows) == 1 else np.stack(rows)

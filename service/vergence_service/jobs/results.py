@@ -1,0 +1,203 @@
+"""What a job found, frame by frame on disk, and the forms in which it is handed out.
+
+::
+
+    result/rig.json         the rectified rig that the maps are stated in
+    result/000000.npz       offset_px float32 [H, W], NaN where there is no value; confidence uint8
+                            [H, W] where it was asked for
+
+Like the files of ``vergence run`` and of the data sets, disparity here is the pixel offset
+u_left - u_right as the images show it; depth takes the principal points into account.
+"""
+
+import dataclasses
+import io
+import json
+import tempfile
+import zipfile
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vergence_proto.datasets import StereoSource, encode_disparity_png, encode_pfm
+from vergence_proto.geometry import RectifiedRig
+from vergence_proto.types import DisparityMap, Plane
+from vergence_service.jobs.job import Output
+
+_RIG = "rig.json"
+_CHUNK = 1 << 20
+# Of the colours: all but the nearest and farthest hundredth of the first frame's disparities.
+_COLOUR_RANGE_PCT = (1, 99)
+
+
+class ResultFormat(StrEnum):
+    PNG16 = "png16"  # 16-bit PNG, x256, 0 = none, as KITTI does; confidence 8-bit
+    PFM = "pfm"
+    NPZ = "npz"
+    MP4 = "mp4"  # disparity in colours, to look at
+
+
+class CannotEncode(RuntimeError):
+    """OpenCV on this machine cannot write the format."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameResult:
+    rig: RectifiedRig
+    offset_px: Plane
+    confidence: NDArray[np.uint8] | None
+
+    @property
+    def depth_m(self) -> Plane:
+        zero_px = np.float32(self.rig.offset_of_zero_disparity_px)
+        return self.rig.depth_from_disparity(self.offset_px - zero_px)
+
+
+def start_result(folder: Path, rig: RectifiedRig) -> None:
+    """Begin anew, whatever an earlier attempt has left."""
+    folder.mkdir(exist_ok=True)
+    for old in folder.iterdir():
+        old.unlink()
+    (folder / _RIG).write_text(json.dumps(dataclasses.asdict(rig)), "utf-8")
+
+
+def write_frame(folder: Path, index: int, disparity: DisparityMap) -> None:
+    arrays: dict[str, NDArray[Any]] = {"offset_px": disparity.offset_px}
+    if disparity.confidence is not None:
+        arrays["confidence"] = disparity.confidence
+    np.savez(folder / f"{index:06d}.npz", allow_pickle=False, **arrays)
+
+
+def result_bytes(source: StereoSource, outputs: Collection[Output]) -> int:
+    """What the result of a whole sequence will take."""
+    pixels = source.rig.left.width * source.rig.left.height
+    return len(source) * pixels * (5 if Output.CONFIDENCE in outputs else 4)
+
+
+def holds_frames(folder: Path, count: int) -> bool:
+    """Whether the first ``count`` are there and whole; what was written last may not be."""
+    try:
+        RectifiedRig(**json.loads((folder / _RIG).read_text("utf-8")))
+        for index in range(count):
+            with zipfile.ZipFile(folder / f"{index:06d}.npz") as file:
+                if file.testzip() is not None:
+                    return False
+    except (OSError, TypeError, ValueError, zipfile.BadZipFile):
+        return False
+    return True
+
+
+def read_frames(folder: Path) -> Iterator[FrameResult]:
+    rig = RectifiedRig(**json.loads((folder / _RIG).read_text("utf-8")))
+    for path in sorted(folder.glob("*.npz")):
+        with np.load(path) as arrays:
+            yield FrameResult(rig, arrays["offset_px"], arrays.get("confidence"))
+
+
+def zip_of(folder: Path, form: ResultFormat, outputs: Collection[Output]) -> Iterator[bytes]:
+    """A zip with one file a frame and output, in pieces, as it is made."""
+    sink = _Sink()
+    with zipfile.ZipFile(sink, "w") as archive:
+        archive.writestr(_RIG, (folder / _RIG).read_bytes())
+        for index, frame in enumerate(read_frames(folder)):
+            for name, content in _files(frame, form, outputs):
+                archive.writestr(name.format(index), content)
+            yield sink.take()
+    yield sink.take()
+
+
+def mp4_of(folder: Path, *, fps: float) -> Iterator[bytes]:
+    """Disparity as a film, in pieces. Raises CannotEncode, before the first of them."""
+    with tempfile.TemporaryDirectory() as scratch:
+        path = Path(scratch) / "disparity.mp4"
+        _write_mp4(path, (frame.offset_px for frame in read_frames(folder)), fps)
+        with path.open("rb") as file:
+            while chunk := file.read(_CHUNK):
+                yield chunk
+
+
+def _files(
+    frame: FrameResult, form: ResultFormat, outputs: Collection[Output]
+) -> Iterator[tuple[str, bytes]]:
+    planes: dict[Output, Callable[[], Plane]] = {
+        Output.DISPARITY: lambda: frame.offset_px,
+        Output.DEPTH: lambda: frame.depth_m,
+    }
+    if form is ResultFormat.NPZ:
+        arrays: dict[str, NDArray[Any]] = {
+            name: plane() for name, plane in planes.items() if name in outputs
+        }
+        if frame.confidence is not None:
+            arrays[Output.CONFIDENCE] = frame.confidence
+        yield "{:04d}.npz", _npz(arrays)
+        return
+    encode, extension = _ENCODERS[form]
+    for name, plane in planes.items():
+        if name in outputs:
+            yield f"{name}/{{:04d}}.{extension}", encode(plane())
+    if frame.confidence is not None:
+        done, file = cv2.imencode(".png", frame.confidence)
+        if not done:
+            raise CannotEncode("OpenCV cannot write PNG here")
+        yield f"{Output.CONFIDENCE}/{{:04d}}.png", file.tobytes()
+
+
+_ENCODERS: Mapping[ResultFormat, tuple[Callable[[Plane], bytes], str]] = {
+    ResultFormat.PNG16: (encode_disparity_png, "png"),
+    ResultFormat.PFM: (encode_pfm, "pfm"),
+}
+
+
+def _npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    file = io.BytesIO()
+    np.savez(file, allow_pickle=False, **arrays)
+    return file.getvalue()
+
+
+def _write_mp4(path: Path, frames: Iterator[Plane], fps: float) -> None:
+    writer: cv2.VideoWriter | None = None
+    low = high = 0.0
+    for offset_px in frames:
+        height, width = offset_px.shape
+        known = np.isfinite(offset_px)
+        if writer is None:
+            code = cv2.VideoWriter.fourcc(*"mp4v")
+            writer = cv2.VideoWriter(str(path), code, fps, (width, height))
+            if not writer.isOpened():
+                raise CannotEncode("OpenCV cannot write MP4 here; take another format")
+            if known.any():
+                low, high = np.percentile(offset_px[known], _COLOUR_RANGE_PCT)
+        share = (np.nan_to_num(offset_px) - low) / max(high - low, 1e-6)
+        levels = (255 * np.clip(share, 0, 1)).astype(np.uint8)
+        colours = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)
+        colours[~known] = 0
+        writer.write(colours)
+    if writer is not None:
+        writer.release()
+
+
+class _Sink(io.RawIOBase):
+    """A file that zipfile writes to and cannot seek in, emptied between frames."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._pieces: list[bytes] = []
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: Any) -> int:  # whatever has a buffer, as the base class takes it
+        piece = bytes(data)
+        self._pieces.append(piece)
+        return len(piece)
+
+    def take(self) -> bytes:
+        taken = b"".join(self._pieces)
+        self._pieces.clear()
+        return taken

@@ -1,0 +1,35 @@
+"""Whether a state can be continued by the next view, or the stream must start anew, and why."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vergence_proto.types import Origin
+from vergence_service.inference.model import RecurrentState, View
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ContinuityLimits:
+    """What may lie between two stepped frames of one stream."""
+
+    max_gap_s: float
+    max_jump_m: float
+    max_jump_deg: float
+
+
+def break_between(state: RecurrentState, view: View, limits: ContinuityLimits) -> Origin | None:
+    """The reason why ``view`` cannot continue ``state``, or None if it can."""
+    if view.world_from_left is None or state.world_from_left is None:
+        return Origin.RESET_POSE_LOST
+    if view.capture_ns < state.capture_ns:
+        return Origin.RESET_TIME_BACKWARDS
+    if view.capture_ns - state.capture_ns > limits.max_gap_s * 1e9:
+        return Origin.RESET_GAP
+    curr_from_prev = view.world_from_left.inverse() @ state.world_from_left
+    jump_m = float(np.linalg.norm(curr_from_prev.translation_m))
+    positions_known = view.position_known and state.position_known
+    cosine = (float(np.trace(curr_from_prev.rotation)) - 1) / 2
+    jump_deg = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+    if (positions_known and jump_m > limits.max_jump_m) or jump_deg > limits.max_jump_deg:
+        return Origin.RESET_POSE_JUMP
+    return None

@@ -1,0 +1,284 @@
+"""The use case: open a stream, step it frame by frame, close it."""
+
+import asyncio
+from collections.abc import Callable, Mapping
+from enum import Enum
+
+from vergence_proto.errors import (
+    DepthError,
+    Draining,
+    FrameTooLarge,
+    ModelChanged,
+    NonFinite,
+    NotReady,
+    UnknownStream,
+)
+from vergence_proto.model_io import ModelCard
+from vergence_proto.types import (
+    Delivery,
+    DisparityMap,
+    Origin,
+    StereoFrame,
+    StereoRig,
+    Timings,
+)
+from vergence_service.inference.batcher import StepBatcher
+from vergence_service.inference.model import RecurrentState, Step, View, state_bytes
+from vergence_service.metrics import Metrics
+from vergence_service.streams.continuity import ContinuityLimits
+from vergence_service.streams.conversion import Answer, view_of
+from vergence_service.streams.rectify import Rectifier
+from vergence_service.streams.stream import Attachment, Notice, NoticeKind, Opening, Stream
+from vergence_service.streams.table import StreamTable
+
+
+class _Phase(Enum):
+    LOADING = "loading"
+    SERVING = "serving"
+    DRAINING = "draining"
+
+
+class DepthEngine:
+    """Everything a transport may ask for. It knows no wire, and raises only DepthError."""
+
+    def __init__(
+        self,
+        streams: StreamTable,
+        batcher: StepBatcher,
+        *,
+        card: ModelCard,
+        iterations: int,
+        cold_iterations: Mapping[Delivery, int],
+        limits: ContinuityLimits,
+        max_pixels: int,
+        clock: Callable[[], float],
+        metrics: Metrics,
+    ) -> None:
+        self.streams = streams
+        self.card = card
+        self.max_pixels = max_pixels
+        self.metrics = metrics
+        self._batcher = batcher
+        self._iterations = iterations
+        self._cold_iterations = cold_iterations
+        self._limits = limits
+        self._clock = clock
+        self._phase = _Phase.LOADING
+
+    @property
+    def ready(self) -> bool:
+        """New streams are taken."""
+        return self._phase is _Phase.SERVING
+
+    async def start(self) -> None:
+        """Load the model; until it is done every opening is refused with NotReady."""
+        counts = (self._iterations, *self._cold_iterations.values())
+        await self._batcher.warm_up(*map(self.card.iterations_at_most, counts))
+        self._phase = _Phase.SERVING
+
+    def drain(self, *, within_s: float) -> None:
+        """Take no new stream, and tell those that are attached."""
+        self._phase = _Phase.DRAINING
+        notice = Notice(NoticeKind.DRAINING, "the server is shutting down", within_s)
+        for attachment in self.streams.attachments():
+            attachment.notify(notice)
+
+    async def open(
+        self,
+        stream_id: str,
+        opening: Opening,
+        *,
+        attachment: Attachment | None = None,
+        client: str = "",
+    ) -> Stream:
+        """A new stream, which counts to the share of ``client``, an address.
+
+        Raises NotReady, Draining, ModelChanged, BadCalibration, FrameTooLarge, and as
+        StreamTable.open.
+        """
+        self._check_model(opening)
+        rectifier = await self._rectifier(opening.rig)
+        reserve = state_bytes(self.card, rectifier.rig.height, rectifier.rig.width)
+        return self.streams.open(
+            stream_id,
+            opening,
+            rectifier,
+            state_bytes=reserve,
+            attachment=attachment,
+            client=client,
+        )
+
+    def resume(
+        self,
+        stream_id: str,
+        resume_token: bytes,
+        opening: Opening,
+        *,
+        attachment: Attachment,
+        client: str = "",
+    ) -> Stream:
+        """Attach to a stream that is open.
+
+        Raises NotReady, Draining, ModelChanged, and as StreamTable.attach.
+        """
+        self._check_serving()
+        # Before the stream is looked for: a server that restarted has forgotten it, but that its
+        # successor would be another network's is what the client must hear.
+        self._check_model(opening)
+        return self.streams.attach(
+            stream_id, resume_token, opening, attachment=attachment, client=client
+        )
+
+    async def step(
+        self,
+        stream_id: str,
+        decode: Callable[[], StereoFrame],
+        *,
+        arrived_s: float,
+        max_age_s: float | None = None,
+    ) -> Answer:
+        """Advance one stream by one frame; a step that failed has left the stream as it was.
+
+        ``decode`` runs in a worker thread when the frame's turn has come, so a frame that is
+        displaced before is never decoded. Of the answer the caller makes the map, together with
+        what is sent of it. Raises what ``decode`` raises, UnknownStream, StreamExpired,
+        BadShape, FrameOutOfOrder, FrameStale, ModelFailed; and NonFinite, after which the
+        stream starts anew.
+        """
+        stream = self.streams.get(stream_id)
+        self.streams.touch(stream)
+        return await self._step(stream, decode, arrived_s=arrived_s, max_age_s=max_age_s)
+
+    async def open_apart(self, opening: Opening, *, state: RecurrentState | None = None) -> Stream:
+        """A stream that nobody attaches to, for a sequence that is known from its first frame on.
+
+        It is in no table: it takes no place from live streams, and ends with its last reference.
+        ``state`` is what the frames before have left. Raises NotReady, Draining, BadCalibration,
+        FrameTooLarge.
+        """
+        rectifier = await self._rectifier(opening.rig)
+        origin = Origin.COLD_START if state is None else Origin.WARM
+        return Stream(
+            "", "", b"", opening, rectifier, 0, None, self._clock(), state=state, origin=origin
+        )
+
+    async def step_apart(
+        self, stream: Stream, decode: Callable[[], StereoFrame]
+    ) -> tuple[DisparityMap, RecurrentState]:
+        """As :meth:`step`, of a stream that :meth:`open_apart` made: the map, the state left."""
+        answer = await self._step(stream, decode, arrived_s=self._clock(), max_age_s=None)
+        return await asyncio.to_thread(answer.disparity_map), answer.timed.result.state
+
+    async def _step(
+        self,
+        stream: Stream,
+        decode: Callable[[], StereoFrame],
+        *,
+        arrived_s: float,
+        max_age_s: float | None,
+    ) -> Answer:
+        # The lock wakes its waiters in order, so a stream takes its frames one at a time as they
+        # arrived, and no batch ever holds two frames of one stream.
+        async with stream.turn:
+            try:
+                return await self._advance(stream, decode, arrived_s, max_age_s)
+            except DepthError as error:
+                self.count_failed(stream, error)
+                if isinstance(error, NonFinite):
+                    stream.forget(Origin.RESET_NON_FINITE)
+                raise
+
+    async def reset(self, stream_id: str) -> None:
+        """Frames after it start from nothing. Raises UnknownStream, StreamExpired."""
+        stream = self.streams.get(stream_id)
+        async with stream.turn:
+            stream.forget(Origin.RESET_REQUESTED)
+
+    def count_dropped(self, stream: Stream) -> None:
+        """A frame of the stream was displaced by a newer one."""
+        stream.frames_dropped += 1
+        stream.frames_skipped += 1
+        self.metrics.frames_dropped.inc()
+
+    def count_failed(self, stream: Stream, error: DepthError) -> None:
+        """A frame of the stream was answered with an error."""
+        stream.frames_failed += 1
+        stream.frames_skipped += 1
+        self.metrics.frames_failed.labels(error.code).inc()
+
+    def close(self, stream_id: str) -> None:
+        """End a stream and free its state, whichever connection asks.
+
+        Raises UnknownStream, StreamExpired.
+        """
+        stream = self.streams.get(stream_id)
+        self.streams.close(stream)
+        if stream.attachment is not None:
+            stream.attachment.end(UnknownStream(f"stream {stream_id!r} was closed"))
+
+    def _check_serving(self) -> None:
+        match self._phase:
+            case _Phase.LOADING:
+                raise NotReady("the model is loading; try again", retry_after_s=1.0)
+            case _Phase.DRAINING:
+                raise Draining("the server is shutting down; try another one")
+
+    def _check_model(self, opening: Opening) -> None:
+        if opening.weights_sha256 not in ("", self.card.weights_sha256):
+            raise ModelChanged(
+                f"expected a server with weights {opening.weights_sha256[:12]}, this one runs "
+                f"{self.card.name} with {self.card.weights_sha256[:12]}; open a new stream to go "
+                "on with those"
+            )
+
+    async def _rectifier(self, rig: StereoRig) -> Rectifier:
+        self._check_serving()
+        width, height = rig.left.width, rig.left.height
+        if width * height > self.max_pixels:
+            raise FrameTooLarge(
+                f"expected at most {self.max_pixels} pixels an image, got {width}x{height}"
+            )
+        return await asyncio.to_thread(Rectifier.of, rig)
+
+    async def _advance(
+        self,
+        stream: Stream,
+        decode: Callable[[], StereoFrame],
+        arrived_s: float,
+        max_age_s: float | None,
+    ) -> Answer:
+        started_s = self._clock()
+        skipped = stream.frames_skipped
+        frame, view = await asyncio.to_thread(_decoded_view, decode, stream)
+        decode_s = self._clock() - started_s
+        stream.check_order(frame.frame_id)
+        state, origin = stream.state_before(view, self._limits)
+        iterations = self._iterations_of(stream.opening, cold=state is None)
+        timed = await self._batcher.step(
+            Step(view, state, iterations),
+            deadline_s=None if max_age_s is None else arrived_s + max_age_s,
+            live_stream=stream.stream_id if stream.opening.delivery is Delivery.NEWEST else None,
+        )
+        stream.commit(frame.frame_id, timed.result.state, frames_skipped=skipped)
+        self.metrics.frames_stepped.labels(origin.name.lower()).inc()
+        timings = Timings(
+            decode_s=decode_s,
+            queue_s=started_s - arrived_s + timed.queue_s,
+            model_s=timed.model_s,
+        )
+        for stage in ("decode", "queue", "model"):
+            self.metrics.stage_s.labels(stage).observe(getattr(timings, f"{stage}_s"))
+        return Answer(stream, frame.frame_id, view, timed, origin, iterations, skipped, timings)
+
+    def _iterations_of(self, opening: Opening, *, cold: bool) -> int:
+        wanted = (
+            opening.cold_iterations or self._cold_iterations[opening.delivery]
+            if cold
+            else opening.iterations or self._iterations
+        )
+        return self.card.iterations_at_most(wanted)
+
+
+def _decoded_view(decode: Callable[[], StereoFrame], stream: Stream) -> tuple[StereoFrame, View]:
+    frame = decode()
+    return frame, view_of(frame, stream.rectifier, stream.opening.axes)

@@ -1,0 +1,236 @@
+"""The open streams: who has them, within which limits, and when they end."""
+
+import hmac
+import re
+import secrets
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from vergence_proto.errors import (
+    BadCalibration,
+    BadShape,
+    Quota,
+    StateMemory,
+    StreamExists,
+    StreamExpired,
+    StreamLimit,
+    Superseded,
+    UnknownStream,
+)
+from vergence_proto.types import Origin, StereoRig
+from vergence_service.metrics import Metrics
+from vergence_service.streams.rectify import Rectifier
+from vergence_service.streams.stream import Attachment, Notice, NoticeKind, Opening, Stream
+
+# How long an expired stream is told apart from one that never was.
+_TOMBSTONE_S = 300.0
+
+_STREAM_ID = re.compile(r"[A-Za-z0-9._-]{1,128}")
+
+
+class StreamTable:
+    """All streams of one server, within its limits. Time comes from ``clock``, in seconds."""
+
+    def __init__(
+        self,
+        *,
+        capacity: int,
+        per_client: int | None,
+        max_state_bytes: int,
+        idle_timeout_s: float,
+        idle_notice_s: float,
+        detach_grace_s: float,
+        clock: Callable[[], float],
+        metrics: Metrics,
+    ) -> None:
+        self.capacity = capacity
+        self.idle_timeout_s = idle_timeout_s
+        self.detach_grace_s = detach_grace_s
+        self._per_client = per_client
+        self._max_state_bytes = max_state_bytes
+        self._idle_notice_s = idle_notice_s
+        self._clock = clock
+        self._metrics = metrics
+        self._streams: dict[str, Stream] = {}
+        self._expired_s: dict[str, float] = {}  # tombstones
+
+    def __len__(self) -> int:
+        return len(self._streams)
+
+    def attachments(self) -> Iterable[Attachment]:
+        return [stream.attachment for stream in self._streams.values() if stream.attachment]
+
+    def open(
+        self,
+        stream_id: str,
+        opening: Opening,
+        rectifier: Rectifier,
+        *,
+        state_bytes: int,
+        attachment: Attachment | None,
+        client: str,
+    ) -> Stream:
+        """Make a new stream; an empty id lets the server choose one.
+
+        Raises BadShape (the id), StreamExists, Quota, StreamLimit, StateMemory.
+        """
+        self.sweep()
+        stream_id = stream_id or f"s-{secrets.token_hex(8)}"
+        if not _STREAM_ID.fullmatch(stream_id):
+            raise BadShape(
+                f"expected a stream id of 1 to 128 characters of A-Z a-z 0-9 . _ -, "
+                f"got {stream_id[:200]!r}"
+            )
+        if stream_id in self._streams:
+            raise StreamExists(
+                f"stream {stream_id!r} is open; resume it with its token, close it, or choose "
+                "another id"
+            )
+        theirs = [each for each in self._streams.values() if client and each.client == client]
+        if self._per_client is not None and len(theirs) >= self._per_client:
+            raise Quota(
+                f"{client} holds {len(theirs)} streams, as many as one client may; close one, or "
+                "try again later",
+                retry_after_s=self._next_expiry_s(theirs),
+            )
+        if len(self._streams) >= self.capacity:
+            raise StreamLimit(
+                f"the server holds {self.capacity} streams, as many as it may; close one, or "
+                "try again later",
+                retry_after_s=self._next_expiry_s(self._streams.values()),
+            )
+        reserved = self._reserved_bytes()
+        if reserved + state_bytes > self._max_state_bytes:
+            raise StateMemory(
+                f"the stream's state takes {state_bytes} bytes; {reserved} of "
+                f"{self._max_state_bytes} are taken",
+                retry_after_s=self._next_expiry_s(self._streams.values()),
+            )
+        self._expired_s.pop(stream_id, None)
+        stream = Stream(
+            stream_id,
+            client,
+            secrets.token_bytes(16),
+            opening,
+            rectifier,
+            state_bytes,
+            attachment,
+            self._clock(),
+        )
+        self._streams[stream_id] = stream
+        self._count()
+        return stream
+
+    def attach(
+        self,
+        stream_id: str,
+        resume_token: bytes,
+        opening: Opening,
+        *,
+        attachment: Attachment,
+        client: str,
+    ) -> Stream:
+        """Give an open stream to a new connection; the newest attachment wins.
+
+        Raises UnknownStream, StreamExpired, StreamExists (the token is not this stream's) and
+        BadCalibration (the rig is not the one it was opened with).
+        """
+        stream = self.get(stream_id)
+        if not hmac.compare_digest(resume_token, stream.resume_token):
+            raise StreamExists(f"stream {stream_id!r} is open and the resume token is not its own")
+        if not _same_rig(stream.opening.rig, opening.rig):
+            raise BadCalibration(
+                f"stream {stream_id!r} was opened with another rig; open a new stream for this one"
+            )
+        if stream.attachment is not None:
+            stream.attachment.end(
+                Superseded(f"a newer connection attached to stream {stream_id!r}")
+            )
+        stream.opening = opening
+        stream.attachment = attachment
+        stream.client = client  # which may have come back by another network
+        if stream.state is not None:
+            stream.origin = Origin.RESUMED
+        self.touch(stream)
+        return stream
+
+    def detach(self, stream: Stream, attachment: Attachment) -> None:
+        """A connection is gone; its stream waits for the next one, if it was still its own."""
+        if stream.attachment is attachment:
+            stream.attachment = None
+            self.touch(stream)
+
+    def get(self, stream_id: str) -> Stream:
+        """Raises UnknownStream, or StreamExpired if it was open in the last five minutes."""
+        stream = self._streams.get(stream_id)
+        if stream is not None and self._clock() >= self._expiry_s(stream):
+            self._expire(stream)
+        elif stream is not None:
+            return stream
+        if stream_id in self._expired_s:
+            raise StreamExpired(
+                f"stream {stream_id!r} was left without a connection for {self.detach_grace_s:g} s "
+                f"or without a frame for {self.idle_timeout_s:g} s; open it again"
+            )
+        raise UnknownStream(f"no open stream {stream_id!r}; open it before sending frames")
+
+    def touch(self, stream: Stream) -> None:
+        """The stream is in use: it will not expire for another while."""
+        stream.active_s = self._clock()
+        stream.warned = False
+
+    def close(self, stream: Stream) -> None:
+        """End a stream and free its state, from whichever connection."""
+        if self._streams.get(stream.stream_id) is stream:
+            del self._streams[stream.stream_id]
+            self._count()
+
+    def sweep(self) -> None:
+        """Expire what is due, and warn what will be soon."""
+        now_s = self._clock()
+        for stream in list(self._streams.values()):
+            left_s = self._expiry_s(stream) - now_s
+            if left_s <= 0:
+                self._expire(stream)
+            elif stream.attachment and left_s <= self._idle_notice_s and not stream.warned:
+                stream.warned = True
+                message = f"no frame for {now_s - stream.active_s:.0f} s: the stream will expire"
+                stream.attachment.notify(Notice(NoticeKind.EXPIRING, message, left_s))
+        for stream_id, expired_s in list(self._expired_s.items()):
+            if now_s - expired_s > _TOMBSTONE_S:
+                del self._expired_s[stream_id]
+
+    def idle_s(self, stream: Stream) -> float:
+        return self._clock() - stream.active_s
+
+    def _expire(self, stream: Stream) -> None:
+        self.close(stream)
+        self._expired_s[stream.stream_id] = self._clock()
+        if stream.attachment is not None:
+            stream.attachment.end(
+                StreamExpired(
+                    f"stream {stream.stream_id!r} had no frame for {self.idle_timeout_s:g} s; "
+                    "open it again"
+                )
+            )
+
+    def _expiry_s(self, stream: Stream) -> float:
+        patience_s = self.idle_timeout_s if stream.attachment else self.detach_grace_s
+        return stream.active_s + patience_s
+
+    def _next_expiry_s(self, streams: Iterable[Stream]) -> float:
+        return min(map(self._expiry_s, streams), default=0.0) - self._clock()
+
+    def _reserved_bytes(self) -> int:
+        return sum(stream.state_bytes for stream in self._streams.values())
+
+    def _count(self) -> None:
+        self._metrics.streams_open.set(len(self._streams))
+        self._metrics.state_bytes.set(self._reserved_bytes())
+
+
+def _same_rig(one: StereoRig, other: StereoRig) -> bool:
+    return (one.left, one.right) == (other.left, other.right) and np.array_equal(
+        one.left_from_right.matrix, other.left_from_right.matrix
+    )

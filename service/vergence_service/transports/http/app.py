@@ -1,0 +1,136 @@
+"""The HTTP face: sequences and pairs, and for those who look after the server its health."""
+
+import asyncio
+import socket
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, Self
+
+import uvicorn
+from fastapi import APIRouter, FastAPI, Response
+from fastapi.openapi.utils import get_openapi
+from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
+from pydantic.json_schema import models_json_schema
+
+from vergence_service.transports.errors import PortTaken
+from vergence_service.transports.http.errors import Problem, install_problems
+from vergence_service.transports.http.uploads import SequenceForm
+from vergence_service.transports.open_calls import OpenCalls
+
+_ABOUT = """Disparity of whole stereo sequences, as a job, and of single pairs.
+
+Live streams go over gRPC (`vergence.v1.DepthService`). Whatever is refused is answered with problem
+details (RFC 9457), whose `reason` is the one that gRPC gives.
+"""
+# What is left of an answer that is being sent when the server stops.
+_LAST_WORDS_S = 5
+
+
+def make_http_app(
+    *,
+    version: str,
+    ready: Callable[[], bool],
+    registry: CollectorRegistry,
+    routes: Sequence[APIRouter],
+) -> FastAPI:
+    app = FastAPI(title="Vergence", version=version, description=_ABOUT, redoc_url=None)
+    app.openapi = lambda: _openapi(app)  # type: ignore[method-assign] # as FastAPI documents it
+    install_problems(app)
+    for router in (_health_routes(ready, registry), *routes):
+        app.include_router(router)
+    return app
+
+
+def _health_routes(ready: Callable[[], bool], registry: CollectorRegistry) -> APIRouter:
+    router = APIRouter(tags=["health"])
+
+    @router.get("/healthz")
+    async def alive() -> dict[str, str]:
+        """The process answers."""
+        return {"status": "alive"}
+
+    @router.get("/readyz", responses={503: {"description": "New streams are not taken"}})
+    async def readiness(response: Response) -> dict[str, str]:
+        """New streams are taken: 503 while the model loads and while the server drains."""
+        if not ready():
+            response.status_code = 503
+        return {"status": "ready" if ready() else "not ready"}
+
+    @router.get(
+        "/metrics",
+        response_class=Response,
+        responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
+    )
+    async def metrics() -> Response:
+        """What the server counts, for Prometheus."""
+        return Response(generate_latest(registry), media_type=CONTENT_TYPE_LATEST)
+
+    return router
+
+
+def _openapi(app: FastAPI) -> dict[str, Any]:
+    """FastAPI's, and the schemas that it does not find by itself: of problems and of forms."""
+    if app.openapi_schema is None:
+        schema = get_openapi(
+            title=app.title, version=app.version, description=app.description, routes=app.routes
+        )
+        _, found = models_json_schema(
+            [(Problem, "serialization"), (SequenceForm, "validation")],
+            ref_template="#/components/schemas/{model}",
+        )
+        schema.setdefault("components", {}).setdefault("schemas", {}).update(found["$defs"])
+        app.openapi_schema = schema
+    return app.openapi_schema
+
+
+class _Uvicorn(uvicorn.Server):
+    """Leaves the signals to whoever runs the process."""
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+
+class HttpServer:
+    """Serves the app from the start of its context to its end. Raises PortTaken.
+
+    ``stopping`` is set before it waits for the answers that are being sent, and ``calls`` end.
+    """
+
+    def __init__(
+        self, app: FastAPI, calls: OpenCalls, *, host: str, port: int, stopping: asyncio.Event
+    ) -> None:
+        self._app = app
+        self._calls = calls
+        self._address = (host, port)
+        self._stopping = stopping
+        self.port = port
+
+    async def __aenter__(self) -> Self:
+        family = socket.AF_INET6 if ":" in self._address[0] else socket.AF_INET
+        try:
+            self._socket = socket.create_server(self._address, family=family)
+        except OSError:
+            raise PortTaken("{}:{}".format(*self._address), "http.port") from None
+        self.port = self._socket.getsockname()[1]
+        config = uvicorn.Config(
+            self._app,
+            log_config=None,
+            access_log=False,
+            lifespan="off",
+            timeout_graceful_shutdown=_LAST_WORDS_S,
+        )
+        self._server = _Uvicorn(config)
+        self._task = asyncio.create_task(self._server.serve([self._socket]), name="http")
+        return self
+
+    async def __aexit__(self, *exc_info: object) -> None:
+        self._stopping.set()
+        await self._calls.drain(within_s=0)
+        self._server.should_exit = True
+        await self._task
+        self._socket.close()
+
+    async def drain(self, *, within_s: float) -> None:
+        """Let calls end by themselves; after that, answer what they have sent and end them."""
+        await self._calls.drain(within_s=within_s)

@@ -1,0 +1,152 @@
+"""POST /v1/pairs: two images up, disparity down; curl is enough."""
+
+import asyncio
+import io
+import tempfile
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from fastapi import APIRouter, Query, Request, Response
+from pydantic import BaseModel, ConfigDict, Field
+
+from vergence_proto.datasets import LayoutError, encode_disparity_png, read_image
+from vergence_proto.errors import BadCalibration, BadImage, BadShape, FrameTooLarge
+from vergence_proto.geometry import RectifiedRig
+from vergence_proto.types import Delivery, Image, Plane, StereoFrame, StereoRig
+from vergence_service.jobs.upload_checks import check_file
+from vergence_service.streams.engine import DepthEngine
+from vergence_service.streams.stream import Opening
+from vergence_service.transports.http.errors import PROBLEM_RESPONSE
+from vergence_service.transports.http.uploads import (
+    FORM_TYPE,
+    UploadLimits,
+    media_type,
+    receive_form,
+)
+
+
+class PairFormat(StrEnum):
+    PNG16 = "png16"  # x256, 0 = none, as KITTI does
+    NPY = "npy"  # float32, NaN = none
+
+
+class PairOutput(StrEnum):
+    DISPARITY = "disparity"
+    DEPTH = "depth"
+
+
+class PairQuery(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    format: PairFormat = PairFormat.PNG16
+    output: PairOutput = Field(
+        default=PairOutput.DISPARITY, description="depth, in metres, needs fx_px and baseline_m"
+    )
+    iterations: int = Field(default=0, ge=0, le=64, description="0: those of a cold start")
+    fx_px: float | None = Field(default=None, ge=1, le=1e6)
+    baseline_m: float | None = Field(default=None, ge=1e-4, le=1e3)
+
+
+_FILE = {"type": "string", "format": "binary"}
+_BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            FORM_TYPE: {
+                "schema": {
+                    "type": "object",
+                    "required": ["left", "right"],
+                    "additionalProperties": False,
+                    "properties": {"left": _FILE, "right": _FILE},
+                }
+            }
+        },
+    }
+}
+_ANSWER: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "16-bit PNG (x256, 0 = none) or float32 NPY",
+        "content": {"image/png": {"schema": _FILE}, "application/octet-stream": {"schema": _FILE}},
+    }
+}
+
+
+def pair_routes(engine: DepthEngine, *, limits: UploadLimits) -> APIRouter:
+    router = APIRouter(tags=["pairs"], responses=PROBLEM_RESPONSE)
+
+    @router.post("/v1/pairs", response_class=Response, responses=_ANSWER, openapi_extra=_BODY)
+    async def step_pair(request: Request, query: Annotated[PairQuery, Query()]) -> Response:
+        """Disparity of one rectified pair, stepped cold, without a stream.
+
+        `curl -F left=@left.png -F right=@right.png HOST/v1/pairs -o disparity.png`
+        """
+        left, right = await _images(request, limits, max_pixels=engine.max_pixels)
+        height, width = left.shape[:2]
+        nominal_px = float(width)  # disparity is the same for every focal length
+        rig = RectifiedRig(
+            width=width,
+            height=height,
+            fx=query.fx_px or nominal_px,
+            fy=query.fx_px or nominal_px,
+            cx_left=(width - 1) / 2,
+            cx_right=(width - 1) / 2,
+            cy=(height - 1) / 2,
+            baseline_m=query.baseline_m or 1.0,
+        )
+        if query.output is PairOutput.DEPTH and not (query.fx_px and query.baseline_m):
+            raise BadCalibration("depth needs fx_px and baseline_m; without them take disparity")
+        opening = Opening(
+            StereoRig.from_rectified(rig),
+            delivery=Delivery.EVERY,
+            cold_iterations=query.iterations,
+        )
+        stream = await engine.open_apart(opening)
+        frame = StereoFrame(1, 0, left, right)
+        disparity, _ = await engine.step_apart(stream, lambda: frame)
+        wanted = disparity.depth_m if query.output is PairOutput.DEPTH else disparity.disparity_px
+        return await asyncio.to_thread(_encoded, wanted, query.format)
+
+    return router
+
+
+async def _images(
+    request: Request, limits: UploadLimits, *, max_pixels: int
+) -> tuple[Image, Image]:
+    if media_type(request) != FORM_TYPE:
+        raise BadImage(f"expected a body of {FORM_TYPE} with the files left and right")
+    with tempfile.TemporaryDirectory() as scratch:
+        parts = await receive_form(request, Path(scratch), limits)
+        if sorted(part.name for part in parts) != ["left", "right"]:
+            names = sorted(part.name[:40] for part in parts)
+            raise BadImage(f"expected one file left and one file right, got {names}")
+        images = {
+            part.name: await asyncio.to_thread(_image, part.path, part.name, max_pixels)
+            for part in parts
+        }
+    left, right = images["left"], images["right"]
+    if left.shape != right.shape:
+        raise BadShape(
+            f"both images must have one size, got left {left.shape[1]}x{left.shape[0]} and right "
+            f"{right.shape[1]}x{right.shape[0]}"
+        )
+    return left, right
+
+
+def _image(path: Path, name: str, max_pixels: int) -> Image:
+    try:
+        check_file(path, max_pixels=max_pixels)
+        return read_image(path)
+    except FrameTooLarge as error:
+        raise FrameTooLarge(f"{name} image: {error}") from None
+    except (BadImage, LayoutError) as error:
+        raise BadImage(f"{name} image: {str(error).removeprefix(f'{path}: ')}") from None
+
+
+def _encoded(values: Plane, form: PairFormat) -> Response:
+    if form is PairFormat.PNG16:
+        return Response(encode_disparity_png(values), media_type="image/png")
+    file = io.BytesIO()
+    np.save(file, values, allow_pickle=False)
+    return Response(file.getvalue(), media_type="application/octet-stream")

@@ -1,0 +1,299 @@
+"""/v1/sequences: a whole sequence up, a job, its progress, its result."""
+
+import asyncio
+from collections.abc import AsyncGenerator, AsyncIterator, Iterator
+from contextlib import aclosing
+from datetime import UTC, datetime
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import JSONResponse, StreamingResponse
+from pydantic import BaseModel, ConfigDict, Field, JsonValue
+
+from vergence_proto.errors import BadShape, ErrorCode, NotReady, UnknownSequence
+from vergence_service.jobs.job import JobOptions, JobState, Output
+from vergence_service.jobs.queue import JobQueue, JobStatus
+from vergence_service.jobs.results import CannotEncode, ResultFormat, mp4_of, zip_of
+from vergence_service.transports.http.errors import PROBLEM_RESPONSE
+from vergence_service.transports.http.uploads import (
+    ARCHIVE_TYPES,
+    FORM_TYPE,
+    UploadLimits,
+    client_of,
+    receive_sequence,
+)
+
+_FILM_FPS = 30.0  # of a source that does not state its own
+_TELL_EVERY_S = 0.25
+# A proxy between closes connections that are silent for longer.
+_SILENCE_S = 15.0
+
+_EXAMPLE: dict[str, JsonValue] = {
+    "id": "5f0c9a7be21d4433",
+    "state": "running",
+    "created": "2026-01-31T12:00:00Z",
+    "source": "vergence:room",
+    "frames": 300,
+    "frames_done": 120,
+    "ahead": 0,
+    "fps": 31.5,
+    "eta_s": 5.7,
+    "output": ["disparity"],
+    "iterations": 0,
+    "metrics": False,
+    "accuracy": None,
+    "reason": None,
+    "message": None,
+}
+
+
+class SubmitQuery(BaseModel):
+    """How a sequence is to be stepped, and what is wanted of it."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    source: str | None = Field(
+        default=None,
+        description="KIND:PATH in the archive, as vergence:room or kitti:sequences/00; needed "
+        "where it holds several",
+    )
+    model: str | None = Field(default=None, description="refuse unless the server runs this one")
+    iterations: int = Field(default=0, ge=0, le=64, description="of every step; 0: the default")
+    output: list[Output] = Field(default=[Output.DISPARITY], description="of every frame")
+    metrics: bool = Field(default=False, description="compare with the truth in the archive")
+    wait: bool = Field(default=False, description="answer with the result when it is done")
+    format: ResultFormat = Field(default=ResultFormat.PNG16, description="of the awaited result")
+
+
+class ResultQuery(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    format: ResultFormat = ResultFormat.PNG16
+
+
+class SequenceJob(BaseModel):
+    """A sequence that was accepted."""
+
+    model_config = ConfigDict(json_schema_extra={"example": _EXAMPLE})
+
+    id: str
+    state: JobState
+    created: datetime
+    source: str = Field(description="what is stepped, KIND:PATH in the upload")
+    frames: int
+    frames_done: int
+    ahead: int = Field(description="sequences that run before it")
+    fps: float | None
+    eta_s: float | None = Field(description="of its own frames")
+    output: list[Output]
+    iterations: int
+    metrics: bool
+    accuracy: dict[str, float] | None = Field(description="the mean over frames with truth")
+    reason: ErrorCode | None = Field(description="why it failed")
+    message: str | None
+
+    @classmethod
+    def of(cls, status: JobStatus) -> "SequenceJob":
+        job = status.job
+        return cls(
+            id=job.job_id,
+            state=job.state,
+            created=datetime.fromtimestamp(job.created_s, UTC),
+            source=job.source,
+            frames=job.frames,
+            frames_done=status.frames_done,
+            ahead=status.ahead,
+            fps=status.fps,
+            eta_s=status.eta_s,
+            output=list(job.options.outputs),
+            iterations=job.options.iterations,
+            metrics=job.options.metrics,
+            accuracy=None if job.accuracy is None else dict(job.accuracy),
+            reason=None if job.reason is None else ErrorCode(job.reason),
+            message=job.message,
+        )
+
+
+_FILE = {"type": "string", "format": "binary"}
+_BINARY = {"schema": _FILE}
+_UPLOAD: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            **dict.fromkeys(ARCHIVE_TYPES, _BINARY),
+            FORM_TYPE: {
+                "schema": {
+                    "type": "object",
+                    "description": "either archive alone, or the other three",
+                    "properties": {
+                        "archive": _FILE,
+                        "left": {"type": "array", "items": _FILE},
+                        "right": {"type": "array", "items": _FILE},
+                        "sequence": {"$ref": "#/components/schemas/SequenceForm"},
+                    },
+                },
+            },
+        },
+    }
+}
+_RESULT: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "A zip with a file a frame; with format=mp4 a film",
+        "content": {"application/zip": _BINARY, "video/mp4": _BINARY},
+    }
+}
+_ACCEPTED: dict[int | str, dict[str, Any]] = {
+    202: {"model": SequenceJob, "description": "Accepted: it will be done, come what may"}
+}
+
+
+def sequence_routes(
+    queue: JobQueue, *, model: str, limits: UploadLimits, stopping: asyncio.Event
+) -> APIRouter:
+    """``stopping`` ends what would otherwise keep a connection open while the server stops."""
+    router = APIRouter(tags=["sequences"], responses=PROBLEM_RESPONSE)
+
+    @router.post(
+        "/v1/sequences",
+        status_code=202,
+        responses={**_RESULT, **_ACCEPTED},
+        openapi_extra=_UPLOAD,
+        response_class=Response,
+    )
+    async def submit(request: Request, query: Annotated[SubmitQuery, Query()]) -> Response:
+        """Upload a sequence: an archive in any layout that `vergence run` reads, or a form.
+
+        `curl --data-binary @room.zip -H 'content-type: application/zip' HOST/v1/sequences`
+        """
+        if query.model not in (None, model):
+            raise BadShape(f"expected model {model}, which this server runs, got {query.model!r}")
+        options = JobOptions(
+            iterations=query.iterations,
+            outputs=tuple(dict.fromkeys(query.output)),
+            metrics=query.metrics,
+        )
+        client = client_of(request)
+        async with queue.place(client) as folder:
+            await receive_sequence(request, folder, limits)
+            status = await queue.accept(folder, query.source, options, client=client)
+        job_id = status.job.job_id
+        if query.wait:
+            while not (status := queue.status(job_id)).job.ended and not stopping.is_set():
+                await queue.change(within_s=_TELL_EVERY_S)
+            if status.job.ended:
+                return await _result(queue, job_id, query.format)
+        return JSONResponse(
+            SequenceJob.of(status).model_dump(mode="json"),
+            status_code=202,
+            headers={"Location": f"/v1/sequences/{job_id}"},
+        )
+
+    @router.get("/v1/sequences")
+    async def list_sequences() -> list[SequenceJob]:
+        """Every job that the server knows, oldest first."""
+        return [SequenceJob.of(status) for status in queue.statuses()]
+
+    @router.get("/v1/sequences/{job_id}")
+    async def get_sequence(job_id: str) -> SequenceJob:
+        """How far a job is."""
+        return SequenceJob.of(queue.status(job_id))
+
+    @router.get(
+        "/v1/sequences/{job_id}/events",
+        response_class=StreamingResponse,
+        responses={
+            200: {
+                "description": "Server-sent events: `progress` with the job, until it has ended",
+                "content": {"text/event-stream": {"schema": {"type": "string"}}},
+            }
+        },
+    )
+    async def events(job_id: str) -> StreamingResponse:
+        """Progress, as it is made."""
+        queue.status(job_id)
+        return StreamingResponse(
+            _events(queue, job_id, stopping),
+            media_type="text/event-stream",
+            headers={"Cache-Control": "no-store"},
+        )
+
+    @router.get(
+        "/v1/sequences/{job_id}/result", response_class=StreamingResponse, responses=_RESULT
+    )
+    async def result(job_id: str, query: Annotated[ResultQuery, Query()]) -> Response:
+        """What came of every frame, made while it is sent."""
+        return await _result(queue, job_id, query.format)
+
+    @router.delete("/v1/sequences/{job_id}", status_code=204)
+    async def delete(job_id: str) -> None:
+        """Cancel the job if it has not ended, and remove all that it has."""
+        await queue.delete(job_id)
+
+    return router
+
+
+def no_sequence_routes(why: str) -> APIRouter:
+    """In place of :func:`sequence_routes` where jobs cannot be kept."""
+    router = APIRouter(include_in_schema=False)
+
+    @router.api_route("/v1/sequences{rest:path}", methods=["DELETE", "GET", "POST"])
+    async def refuse(rest: str) -> None:
+        raise NotReady(f"this server takes no sequences: {why}")
+
+    return router
+
+
+async def _events(queue: JobQueue, job_id: str, stopping: asyncio.Event) -> AsyncIterator[str]:
+    loop = asyncio.get_running_loop()
+    told: JobStatus | None = None
+    spoken_s = loop.time()
+    while not stopping.is_set():
+        try:
+            status = queue.status(job_id)
+        except UnknownSequence:
+            yield "event: deleted\ndata: {}\n\n"
+            return
+        if status != told:
+            told, spoken_s = status, loop.time()
+            yield f"event: progress\ndata: {SequenceJob.of(status).model_dump_json()}\n\n"
+        elif loop.time() - spoken_s > _SILENCE_S:
+            spoken_s = loop.time()
+            yield ": still here\n\n"
+        if status.job.ended:
+            return
+        await queue.change(within_s=_TELL_EVERY_S)
+
+
+async def _result(queue: JobQueue, job_id: str, form: ResultFormat) -> Response:
+    job, _ = queue.result(job_id)
+    pieces = _pieces(queue, job_id, form)
+    try:
+        first = await anext(pieces)  # what cannot be encoded is told before the answer begins
+    except CannotEncode as error:
+        raise BadShape(f"format {form}: {error}") from None
+    film = form is ResultFormat.MP4
+    name = f"{job_id}-{job.source.partition(':')[0]}.{'mp4' if film else 'zip'}"
+    return StreamingResponse(
+        _chained(first, pieces),
+        media_type="video/mp4" if film else "application/zip",
+        headers={"Content-Disposition": f'attachment; filename="{name}"'},
+    )
+
+
+async def _chained(first: bytes, rest: AsyncGenerator[bytes, None]) -> AsyncIterator[bytes]:
+    async with aclosing(rest):
+        yield first
+        async for piece in rest:
+            yield piece
+
+
+async def _pieces(queue: JobQueue, job_id: str, form: ResultFormat) -> AsyncGenerator[bytes, None]:
+    job, folder = queue.result(job_id)
+    pieces: Iterator[bytes]
+    if form is ResultFormat.MP4:
+        pieces = mp4_of(folder, fps=job.source_fps or _FILM_FPS)
+    else:
+        pieces = zip_of(folder, form, job.options.outputs)
+    with queue.reading(job_id):
+        while (piece := await asyncio.to_thread(next, pieces, None)) is not None:
+            yield piece

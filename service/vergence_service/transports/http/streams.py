@@ -1,0 +1,195 @@
+"""Live streams over HTTP, for networks that let nothing else through: see http_records."""
+
+import asyncio
+import secrets
+from collections.abc import AsyncIterator, Callable, Coroutine
+from typing import Any
+
+from fastapi import APIRouter, Path, Request, Response
+from fastapi.responses import StreamingResponse
+from google.protobuf.message import DecodeError, Message
+
+from vergence_proto import codec
+from vergence_proto.errors import BadShape, DepthError, FrameTooLarge, ModelFailed, UnknownStream
+from vergence_proto.http_records import (
+    CALL_ID_HEADER,
+    PROTOBUF_TYPE,
+    RECORDS_TYPE,
+    RecordKind,
+    pack_record,
+)
+from vergence_proto.v1 import depth_pb2 as pb
+from vergence_service.transports.http.errors import PROBLEM_RESPONSE, log
+from vergence_service.transports.http.uploads import client_of
+from vergence_service.transports.open_calls import OpenCalls
+from vergence_service.transports.unary import UnaryMethods
+
+_BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {PROTOBUF_TYPE: {"schema": {"type": "string", "format": "binary"}}},
+    }
+}
+
+
+def stream_routes(calls: OpenCalls, unary: UnaryMethods) -> APIRouter:
+    router = APIRouter(tags=["streams"], responses=PROBLEM_RESPONSE)
+    open_calls: dict[str, _HttpCall] = {}
+    methods: dict[str, _Method] = {
+        "GetServerInfo": _method(pb.GetServerInfoRequest, unary.server_info),
+        "GetStream": _method(pb.GetStreamRequest, unary.stream),
+        "ResetStream": _method(pb.ResetStreamRequest, unary.reset),
+        "CloseStream": _method(pb.CloseStreamRequest, unary.close),
+    }
+
+    @router.post(
+        "/v1/streams",
+        response_class=StreamingResponse,
+        openapi_extra=_BODY,
+        responses={200: {"content": {RECORDS_TYPE: {"schema": {"type": "string"}}}}},
+    )
+    async def open_stream(request: Request) -> StreamingResponse:
+        """Open or resume a stream with a StreamDepthRequest; its answers come as records."""
+        call = _HttpCall(calls, client=client_of(request))
+        first = await call.begin(await _message(request, pb.StreamDepthRequest, calls))
+        open_calls[call.call_id] = call
+
+        async def records() -> AsyncIterator[bytes]:
+            try:
+                yield first
+                async for record in call.records():
+                    yield record
+            finally:
+                del open_calls[call.call_id]
+                await call.leave()
+
+        return StreamingResponse(
+            records(), media_type=RECORDS_TYPE, headers={CALL_ID_HEADER: call.call_id}
+        )
+
+    @router.post("/v1/streams/{call_id}", status_code=204, openapi_extra=_BODY)
+    async def send(call_id: str, request: Request) -> None:
+        """One StreamDepthRequest to an open call; waits while the call takes no more."""
+        if call_id not in open_calls:
+            raise UnknownStream("no open call of this id; open or resume the stream")
+        call = open_calls[call_id]
+        try:
+            await call.put(await _message(request, pb.StreamDepthRequest, calls))
+        except DepthError as error:
+            call.end(error)  # what was in the message would never be answered
+            raise
+
+    @router.post(
+        "/v1/methods/{method}",
+        response_class=Response,
+        openapi_extra=_BODY,
+        responses={200: {"content": {PROTOBUF_TYPE: {"schema": {"type": "string"}}}}},
+    )
+    async def ask(
+        request: Request, method: str = Path(description="as in depth.proto, GetServerInfo")
+    ) -> Response:
+        """The methods of DepthService that are one question and one answer."""
+        if method not in methods:
+            raise BadShape(f"expected one of {', '.join(methods)}, got {method[:64]!r}")
+        answer = await methods[method](request, calls)
+        return Response(answer.SerializeToString(), media_type=PROTOBUF_TYPE)
+
+    return router
+
+
+class _HttpCall:
+    """Translates between requests and a DepthCall."""
+
+    def __init__(self, calls: OpenCalls, *, client: str) -> None:
+        self.call_id = secrets.token_urlsafe(16)
+        self._client = client
+        self._calls = calls
+        # One of each: whoever is ahead waits for the other, as on a connection that is full.
+        self._incoming: asyncio.Queue[pb.StreamDepthRequest] = asyncio.Queue(1)
+        self._outgoing: asyncio.Queue[bytes] = asyncio.Queue(1)
+        self._ended = asyncio.Event()
+        self._opened = False
+        self._refusal: DepthError | None = None  # of the opening
+
+    async def begin(self, opening: pb.StreamDepthRequest) -> bytes:
+        """Start the call; the first record of its answer. Raises the error of the opening."""
+        self._call = self._calls.make(self._requests(opening), self._write, client=self._client)
+        self._task = asyncio.create_task(self._run(), name="HTTP call")
+        first = await self._outgoing.get()
+        if self._refusal is not None:
+            raise self._refusal
+        return first
+
+    async def put(self, message: pb.StreamDepthRequest) -> None:
+        ended = asyncio.create_task(self._ended.wait())
+        put = asyncio.create_task(self._incoming.put(message))
+        try:
+            await asyncio.wait([ended, put], return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            ended.cancel()
+            put.cancel()
+
+    def end(self, error: DepthError) -> None:
+        self._call.end(error)
+
+    async def records(self) -> AsyncIterator[bytes]:
+        while not (self._ended.is_set() and self._outgoing.empty()):
+            yield await self._outgoing.get()
+
+    async def leave(self) -> None:
+        """The client is gone, or has all: the stream waits for its next attachment."""
+        self._task.cancel()
+        await asyncio.gather(self._task, return_exceptions=True)
+
+    async def _run(self) -> None:
+        end = b""
+        try:
+            await self._calls.run(self._call)
+        except DepthError as error:
+            end = self._told(error)
+        except Exception as error:
+            log.error("a call failed in a way that nobody foresaw", exc_info=error)
+            end = self._told(ModelFailed("the server failed; its log says why"))
+        # Not in a finally: a call that was cancelled has nobody to tell.
+        await self._outgoing.put(pack_record(RecordKind.END, end))
+        self._ended.set()
+
+    def _told(self, error: DepthError) -> bytes:
+        if not self._opened:
+            self._refusal = error
+        return codec.error_to_frame_error(0, error).SerializeToString()
+
+    async def _requests(
+        self, opening: pb.StreamDepthRequest
+    ) -> AsyncIterator[pb.StreamDepthRequest]:
+        yield opening
+        while True:
+            yield await self._incoming.get()
+
+    async def _write(self, response: pb.StreamDepthResponse) -> None:
+        self._opened = True
+        await self._outgoing.put(pack_record(RecordKind.MESSAGE, response.SerializeToString()))
+
+
+_Method = Callable[[Request, OpenCalls], Coroutine[Any, Any, Message]]
+
+
+def _method(question: type[Any], answer: Callable[[Any], Coroutine[Any, Any, Message]]) -> _Method:
+    async def ask(request: Request, calls: OpenCalls) -> Message:
+        return await answer(await _message(request, question, calls))
+
+    return ask
+
+
+async def _message(request: Request, kind: type[Any], calls: OpenCalls) -> Any:
+    """The body as a message of ``kind``. Raises FrameTooLarge, BadShape."""
+    limit = calls.limits.max_frame_bytes
+    body = bytearray()
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > limit + 4096:  # what is round a frame
+            raise FrameTooLarge(f"expected a message of at most {limit} bytes")
+    try:
+        return kind.FromString(bytes(body))
+    except DecodeError:
+        raise BadShape(f"expected a {kind.DESCRIPTOR.name} as {PROTOBUF_TYPE}") from None

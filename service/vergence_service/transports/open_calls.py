@@ -1,0 +1,60 @@
+"""The StreamDepth calls that are open on one transport."""
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable
+
+from vergence_proto.errors import Draining
+from vergence_proto.v1 import depth_pb2 as pb
+from vergence_service.streams.engine import DepthEngine
+from vergence_service.transports.stream_call import DepthCall, StreamLimits
+
+
+class OpenCalls:
+    """Makes calls, knows those that run, and ends them when the server drains."""
+
+    def __init__(
+        self, engine: DepthEngine, *, limits: StreamLimits, clock: Callable[[], float]
+    ) -> None:
+        self.limits = limits
+        self._engine = engine
+        self._clock = clock
+        self._running: set[DepthCall] = set()
+        self._idle = asyncio.Event()
+        self._idle.set()
+
+    def make(
+        self,
+        requests: AsyncIterator[pb.StreamDepthRequest],
+        write: Callable[[pb.StreamDepthResponse], Awaitable[None]],
+        *,
+        client: str,
+    ) -> DepthCall:
+        """``client`` is the address that the call comes from; empty where nobody knows."""
+        return DepthCall(
+            self._engine,
+            requests,
+            write,
+            client=client,
+            limits=self.limits,
+            clock=self._clock,
+        )
+
+    async def run(self, call: DepthCall) -> None:
+        """Serve the call to its end. Raises the DepthError that it ends with, if any."""
+        self._running.add(call)
+        self._idle.clear()
+        try:
+            await call.run()
+        finally:
+            self._running.discard(call)
+            if not self._running:
+                self._idle.set()
+
+    async def drain(self, *, within_s: float) -> None:
+        """Let calls end by themselves; after that, answer what they have sent and end them."""
+        try:
+            async with asyncio.timeout(within_s):
+                await self._idle.wait()
+        except TimeoutError:
+            for call in self._running:
+                call.finish(Draining("the server is shutting down; continue on another one"))

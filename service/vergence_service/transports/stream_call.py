@@ -1,0 +1,208 @@
+"""One StreamDepth call, whatever carries it: a reader, a stepper and a sender, so they overlap."""
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+from vergence_proto import codec
+from vergence_proto.errors import BadShape, DepthError, StreamExists, UnknownStream
+from vergence_proto.v1 import depth_pb2 as pb
+from vergence_service.streams.engine import DepthEngine
+from vergence_service.streams.stream import Notice, Opening, Stream
+from vergence_service.transports.mailbox import Letter, Mailbox
+from vergence_service.transports.outbox import Outbox
+from vergence_service.transports.unary import model_info
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamLimits:
+    credit: int  # frames that a client may have unanswered
+    waiting_frames: int  # of a lossless stream, before the sender waits
+    max_frame_bytes: int
+
+
+class DepthCall:
+    """One connection to one stream: the stream's attachment."""
+
+    def __init__(
+        self,
+        engine: DepthEngine,
+        requests: AsyncIterator[pb.StreamDepthRequest],
+        write: Callable[[pb.StreamDepthResponse], Awaitable[None]],
+        *,
+        client: str,
+        limits: StreamLimits,
+        clock: Callable[[], float],
+    ) -> None:
+        self._engine = engine
+        self._requests = requests
+        self._write = write
+        self._client = client
+        self._limits = limits
+        self._clock = clock
+        self._outbox = Outbox(write, clock=clock, metrics=engine.metrics)
+        self._reader: asyncio.Task[None] | None = None
+        self._stepper: asyncio.Task[None] | None = None
+        self._stream: Stream | None = None
+        self._error: DepthError | None = None  # what the call ends with
+        self._client_is_done = False
+
+    def notify(self, notice: Notice) -> None:
+        self._outbox.put_notice(notice)
+
+    async def tell_lost(self, frame_ids: Sequence[int]) -> None:
+        """Count and answer frames that, as the transport knows, were sent and never came."""
+        if self._stream is not None and frame_ids:
+            await self._drop(self._stream, frame_ids)
+
+    def end(self, error: DepthError) -> None:
+        """Stop reading and stepping at once, send what is ready, and end with the error."""
+        self.finish(error)
+        if self._stepper is not None:
+            self._stepper.cancel()
+
+    def finish(self, error: DepthError) -> None:
+        """Stop reading, answer what has arrived, and end with the error."""
+        self._error = self._error or error
+        if self._reader is not None:
+            self._reader.cancel()
+
+    async def run(self) -> None:
+        """Serve the call to its end. Raises the DepthError that it ends with, if any."""
+        stream, resumed = await self._open()
+        self._stream = stream
+        try:
+            await self._write(pb.StreamDepthResponse(opened=self._opened(stream, resumed)))
+            if self._error is None:
+                await self._serve(stream)
+        finally:
+            self._engine.streams.detach(stream, self)
+        if self._error is not None:
+            raise self._error
+        if self._client_is_done:
+            self._engine.close(stream.stream_id)
+
+    async def _serve(self, stream: Stream) -> None:
+        mailbox: Mailbox[pb.Frame]
+        mailbox = Mailbox(stream.opening.delivery, capacity=self._limits.waiting_frames)
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._outbox.send())
+            self._reader = tasks.create_task(self._read(stream, mailbox))
+            self._stepper = tasks.create_task(self._step(stream, mailbox))
+            await asyncio.wait([self._reader, self._stepper])
+            await self._outbox.finish()
+
+    async def _open(self) -> tuple[Stream, bool]:
+        first = await anext(aiter(self._requests), None)
+        if first is None or not first.HasField("open"):
+            raise UnknownStream("the first message of a call must open or resume a stream")
+        request = first.open
+        opening = Opening(
+            rig=codec.rig_from_proto(request.rig),
+            axes=codec.axes_from_proto(request.axes),
+            delivery=codec.delivery_from_proto(request.delivery),
+            output=codec.output_format_from_proto(request.output),
+            iterations=request.iterations,
+            cold_iterations=request.cold_iterations,
+            weights_sha256=request.weights_sha256,
+        )
+        if request.resume_token:
+            resumed = self._engine.resume(
+                request.stream_id,
+                request.resume_token,
+                opening,
+                attachment=self,
+                client=self._client,
+            )
+            return resumed, True
+        opened = await self._engine.open(
+            request.stream_id, opening, attachment=self, client=self._client
+        )
+        return opened, False
+
+    def _opened(self, stream: Stream, resumed: bool) -> pb.StreamOpened:
+        return pb.StreamOpened(
+            stream_id=stream.stream_id,
+            resume_token=stream.resume_token,
+            credit=self._limits.credit,
+            rig=codec.rectified_rig_to_proto(stream.rectifier.rig),
+            model=model_info(self._engine.card),
+            resumed=resumed,
+            detach_grace_s=self._engine.streams.detach_grace_s,
+            idle_timeout_s=self._engine.streams.idle_timeout_s,
+            last_frame_id=stream.last_frame_id,
+        )
+
+    async def _read(self, stream: Stream, mailbox: Mailbox[pb.Frame]) -> None:
+        try:
+            async for request in self._requests:
+                arrived_s = self._clock()
+                match request.WhichOneof("message"):
+                    case "frame":
+                        await self._receive(stream, mailbox, request.frame, arrived_s)
+                    case "ping":
+                        await self._outbox.put_pong(request.ping, arrived_s=arrived_s)
+                    case "reset":
+                        mailbox.reset()
+                    case "end":
+                        self._client_is_done = True
+                        return
+                    case "open":
+                        self.end(StreamExists("this call has opened its stream already"))
+                    case None:
+                        self.end(BadShape("expected one of the messages of depth.proto, got none"))
+        except DepthError as error:  # what came is no message
+            self.end(error)
+        finally:
+            await mailbox.finish()
+
+    async def _receive(
+        self, stream: Stream, mailbox: Mailbox[pb.Frame], frame: pb.Frame, arrived_s: float
+    ) -> None:
+        try:
+            displaced = await mailbox.put(Letter(frame.frame_id, frame, arrived_s))
+        except DepthError as error:
+            self._engine.count_failed(stream, error)
+            await self._refuse(frame.frame_id, error)
+            return
+        if displaced is not None:
+            await self._drop(stream, [displaced.frame_id])
+
+    async def _drop(self, stream: Stream, frame_ids: Sequence[int]) -> None:
+        for _ in frame_ids:
+            self._engine.count_dropped(stream)
+        dropped = pb.FramesDropped(frame_ids=frame_ids)
+        await self._outbox.put(pb.StreamDepthResponse(frames_dropped=dropped))
+
+    async def _step(self, stream: Stream, mailbox: Mailbox[pb.Frame]) -> None:
+        rig = stream.rectifier.rig
+        while True:
+            await self._outbox.reserve_map()
+            letter = await mailbox.take()
+            if letter is None:
+                return
+            frame = letter.content
+            try:
+                if letter.reset_before:
+                    await self._engine.reset(stream.stream_id)
+                answer = await self._engine.step(
+                    stream.stream_id,
+                    partial(
+                        codec.frame_from_proto,
+                        frame,
+                        size=(rig.width, rig.height),
+                        max_bytes=self._limits.max_frame_bytes,
+                    ),
+                    arrived_s=letter.arrived_s,
+                    max_age_s=frame.max_age_s if frame.HasField("max_age_s") else None,
+                )
+            except DepthError as error:
+                self._outbox.release_map()
+                await self._refuse(letter.frame_id, error)
+            else:
+                await self._outbox.put_map(answer, arrived_s=letter.arrived_s)
+
+    async def _refuse(self, frame_id: int, error: DepthError) -> None:
+        message = codec.error_to_frame_error(frame_id, error)
+        await self._outbox.put(pb.StreamDepthResponse(frame_error=message))

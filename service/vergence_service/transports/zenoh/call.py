@@ -1,0 +1,125 @@
+"""One attachment to a stream over Zenoh: a StreamDepth call made of keys."""
+
+from collections.abc import AsyncIterator
+
+import zenoh
+from google.protobuf.message import Message
+from google.rpc import status_pb2
+
+from vergence_proto.errors import Quota
+from vergence_proto.v1 import depth_pb2 as pb
+from vergence_proto.zenoh.inbox import Inbox
+from vergence_proto.zenoh.keys import OPEN, StreamKeys, ask_key
+from vergence_proto.zenoh.session import Undeclarable, ZenohPeer
+from vergence_service.transports.open_calls import OpenCalls
+from vergence_service.transports.zenoh.errors import status_of
+
+
+class ZenohCall:
+    """Translates between the keys of one stream and a DepthCall. Made in answer to an open query.
+
+    A live frame, and the answer to one, is dropped where the way is full rather than kept until it
+    is old. The call finds which frames were lost by the gaps in their ids and answers them as
+    dropped, and every pong says which are still to be answered, so that no credit is lost.
+    """
+
+    def __init__(
+        self,
+        peer: ZenohPeer,
+        query: zenoh.Query,
+        opening: pb.OpenStream,
+        *,
+        namespace: str,
+        attachment_id: str,
+        calls: OpenCalls,
+    ) -> None:
+        self._peer = peer
+        self._query: zenoh.Query | None = query  # until it is answered
+        self._opening = opening
+        self._namespace = namespace
+        self._attachment_id = attachment_id
+        self._calls = calls
+        self._live = opening.delivery != pb.DELIVERY_EVERY
+        self._call = calls.make(self._requests(), self._write, client="")
+        self._inbox = Inbox(
+            attachment_id,
+            bulky=pb.Frame,
+            room=1 if self._live else calls.limits.credit,
+            displaces=self._live,
+        )
+        self._subscription: Undeclarable | None = None
+        self._unanswered: set[int] = set()  # frame ids
+        self._last_frame_id: int | None = None
+
+    async def run(self) -> None:
+        """Serve the call to its end, and tell the client how it ended."""
+        end: Message = pb.End()
+        try:
+            await self._calls.run(self._call)
+        except Exception as error:
+            end = status_of(error)
+        finally:
+            if self._subscription is not None:
+                await self._peer.undeclare(self._subscription)
+        if self._query is None:
+            await self._peer.put(self._keys.status, end, attachment_id=self._attachment_id)
+        elif isinstance(end, status_pb2.Status):
+            await self._peer.refuse(self._query, end)
+
+    async def _requests(self) -> AsyncIterator[pb.StreamDepthRequest]:
+        yield pb.StreamDepthRequest(open=self._opening)
+        while True:
+            try:
+                message = await self._inbox.take()
+            except Quota as error:
+                self._call.end(error)
+                return
+            match message:
+                case pb.Frame():
+                    await self._note(message.frame_id)
+                    yield pb.StreamDepthRequest(frame=message)
+                case pb.Ping():
+                    yield pb.StreamDepthRequest(ping=message)
+                case pb.Reset():
+                    yield pb.StreamDepthRequest(reset=message)
+                case pb.End():
+                    yield pb.StreamDepthRequest(end=message)
+
+    async def _note(self, frame_id: int) -> None:
+        last = self._last_frame_id
+        if last is not None:
+            # A client has no more than its credit unanswered, so no more can be missing.
+            oldest = max(last + 1, frame_id - self._calls.limits.credit)
+            await self._call.tell_lost(range(oldest, frame_id))
+        self._last_frame_id = frame_id
+        self._unanswered.add(frame_id)
+
+    async def _write(self, response: pb.StreamDepthResponse) -> None:
+        match response.WhichOneof("message"):
+            case "opened":
+                await self._accept(response.opened)
+            case "disparity":
+                self._unanswered.discard(response.disparity.frame_id)
+                await self._send(self._keys.disparity, response.disparity)
+            case "frame_error":
+                self._unanswered.discard(response.frame_error.frame_id)
+                await self._send(self._keys.status, response)
+            case "frames_dropped":
+                self._unanswered.difference_update(response.frames_dropped.frame_ids)
+                await self._send(self._keys.status, response)
+            case "pong":
+                response.pong.unanswered_frame_ids.extend(sorted(self._unanswered))
+                await self._send(self._keys.status, response)
+            case _:
+                await self._send(self._keys.status, response)
+
+    async def _accept(self, opened: pb.StreamOpened) -> None:
+        """Answer the query, ready for the frames that follow at once."""
+        self._keys = StreamKeys(self._namespace, opened.stream_id)
+        self._subscription = await self._peer.subscribe(self._keys.frames, self._inbox.put)
+        query, self._query = self._query, None
+        assert query is not None
+        await self._peer.reply(query, ask_key(self._namespace, self._peer.id, OPEN), opened)
+
+    async def _send(self, key: str, message: Message) -> None:
+        await self._peer.put(key, message, attachment_id=self._attachment_id, may_drop=self._live)

@@ -1,0 +1,170 @@
+"""vergence.v1 over Zenoh: queries to ask and to open, keys to stream, tokens to see who lives."""
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Self, TypeVar
+
+import zenoh
+from google.protobuf.message import DecodeError, Message
+
+from vergence_proto.errors import BadShape
+from vergence_proto.v1 import depth_pb2 as pb
+from vergence_proto.zenoh.keys import ANY, OPEN, UNARY_KEYS, StreamKeys, ask_key, server_key
+from vergence_proto.zenoh.session import ZenohPeer, make_config, reason_of
+from vergence_service.transports.errors import ZenohUnreachable
+from vergence_service.transports.open_calls import OpenCalls
+from vergence_service.transports.unary import UnaryMethods
+from vergence_service.transports.zenoh.call import ZenohCall
+from vergence_service.transports.zenoh.errors import status_of
+
+log = logging.getLogger(__name__)
+
+# A frame just over the limit is still received, so that the refusal can say what the limit is.
+_ROOM_OVER_THE_LIMIT = 1.25
+
+Question = TypeVar("Question", bound=Message)
+
+
+def zenoh_config(
+    file: Path | None,
+    *,
+    mode: str,
+    listen: Sequence[str],
+    connect: Sequence[str],
+    max_frame_bytes: int,
+) -> zenoh.Config:
+    """A file says all but the bound on messages. Raises ZenohUnreachable: it is not one."""
+    bound = int(max_frame_bytes * _ROOM_OVER_THE_LIMIT)
+    try:
+        if file is not None:
+            return make_config(file, max_message_bytes=bound)
+        return make_config(
+            max_message_bytes=bound,
+            mode=mode,
+            listen__endpoints=list(listen),
+            connect__endpoints=list(connect),
+        )
+    except zenoh.ZError as error:
+        raise ZenohUnreachable(reason_of(error)) from None
+
+
+class ZenohServer:
+    """On the network from the start of its context to its end; serves once told to.
+
+    Raises ZenohUnreachable.
+    """
+
+    def __init__(
+        self, unary: UnaryMethods, calls: OpenCalls, *, config: zenoh.Config, namespace: str
+    ) -> None:
+        self._calls = calls
+        self._namespace = namespace
+        self._peer = ZenohPeer(config)
+        self._methods: Mapping[str, tuple[type[Message], Callable[[Any], Awaitable[Message]]]] = {
+            UNARY_KEYS["GetServerInfo"]: (pb.GetServerInfoRequest, unary.server_info),
+            UNARY_KEYS["GetStream"]: (pb.GetStreamRequest, unary.stream),
+            UNARY_KEYS["ResetStream"]: (pb.ResetStreamRequest, unary.reset),
+            UNARY_KEYS["CloseStream"]: (pb.CloseStreamRequest, unary.close),
+        }
+        self._attached: dict[str, asyncio.Task[None]] = {}  # by attachment id
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    async def __aenter__(self) -> Self:
+        try:
+            await self._peer.open()
+        except zenoh.ZError as error:
+            raise ZenohUnreachable(reason_of(error)) from None
+        return self
+
+    async def __aexit__(self, *exc_info: object) -> None:
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self._peer.close()
+
+    async def serving(self) -> None:
+        """Answer, and tell those on the network that this server lives."""
+        peer, namespace = self._peer, self._namespace
+        client_keys = StreamKeys(namespace, ANY).client(ANY)
+        # Held for as long as this server serves: Zenoh ends what nobody refers to.
+        self._declared = [
+            await peer.watch_deaths(client_keys, self._client_died),
+            await peer.answer_queries(ask_key(namespace, peer.id, ANY), self._asked),
+            await peer.declare_alive(server_key(namespace, peer.id)),
+        ]
+
+    async def drain(self, *, within_s: float) -> None:
+        """Let calls end by themselves, then answer what they have sent and end them."""
+        await self._calls.drain(within_s=within_s)
+        if self._tasks:
+            await asyncio.wait(self._tasks, timeout=within_s)
+
+    def _asked(self, query: zenoh.Query) -> None:
+        what = str(query.key_expr).rpartition("/")[2]
+        if what != OPEN:
+            self._start(self._answer(query, what))
+            return
+        attachment_id = (
+            query.attachment.to_bytes().decode(errors="replace") if query.attachment else ""
+        )
+        if not attachment_id or attachment_id in self._attached:
+            error = BadShape("expected an attachment id of its own with each opening")
+            self._start(self._peer.refuse(query, status_of(error)))
+            return
+        task = self._start(self._open(query, attachment_id))
+        # At once, so that a death that comes next finds it.
+        self._attached[attachment_id] = task
+        task.add_done_callback(lambda _: self._attached.pop(attachment_id))
+
+    def _client_died(self, key: str) -> None:
+        if task := self._attached.get(key.rpartition("/")[2]):
+            task.cancel()  # its stream is detached, and kept for the grace
+
+    async def _open(self, query: zenoh.Query, attachment_id: str) -> None:
+        with query:  # dropped at the latest when the call has ended
+            try:
+                opening = _read(query, pb.OpenStream)
+            except BadShape as error:
+                await self._peer.refuse(query, status_of(error))
+                return
+            call = ZenohCall(
+                self._peer,
+                query,
+                opening,
+                namespace=self._namespace,
+                attachment_id=attachment_id,
+                calls=self._calls,
+            )
+            await call.run()
+
+    async def _answer(self, query: zenoh.Query, what: str) -> None:
+        try:
+            if what not in self._methods:
+                raise BadShape(f"expected one of {', '.join([OPEN, *self._methods])}, got {what!r}")
+            question, method = self._methods[what]
+            answer = await method(_read(query, question))
+        except Exception as error:
+            await self._peer.refuse(query, status_of(error))
+        else:
+            await self._peer.reply(query, ask_key(self._namespace, self._peer.id, what), answer)
+
+    def _start(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._ended)
+        return task
+
+    def _ended(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()):
+            log.error("a call could not be answered", exc_info=error)
+
+
+def _read(query: zenoh.Query, kind: type[Question]) -> Question:
+    """Raises BadShape."""
+    try:
+        return kind.FromString(query.payload.to_bytes() if query.payload else b"")
+    except DecodeError:
+        raise BadShape(f"expected a {kind.DESCRIPTOR.full_name}, got other bytes") from None

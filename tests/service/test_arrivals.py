@@ -1,0 +1,132 @@
+"""Live first: other steps fill the gaps between live frames, and are not in the way of the next."""
+
+import asyncio
+from collections.abc import Sequence
+
+from tests.service.test_batcher import make_batcher, make_step
+from tests.support.models import RecallModel
+from tests.support.server import ManualClock
+from vergence_service.inference.arrivals import Due, LiveRhythm
+from vergence_service.inference.batcher import StepBatcher
+from vergence_service.inference.model import Step, StepResult
+
+STEP_S = 0.08
+LIVE, OTHER = 200, 10  # brightness, by which the model tells them apart
+
+
+class TimedModel(RecallModel):
+    """Every step takes as long, by the clock of the test; the order of steps is kept."""
+
+    def __init__(self, clock: ManualClock) -> None:
+        super().__init__()
+        self.stepped: list[int] = []
+        self._clock = clock
+
+    def step(self, steps: Sequence[Step]) -> list[StepResult]:
+        self._clock.advance(STEP_S)
+        self.stepped += [int(row.view.left[0, 0, 0]) for row in steps]
+        return super().step(steps)
+
+
+async def live(batcher: StepBatcher) -> None:
+    await batcher.step(make_step(LIVE), live_stream="headset")
+
+
+async def test_live_steps_overtake_those_that_wait() -> None:
+    model = TimedModel(ManualClock())
+    async with make_batcher(model) as batcher:
+        with model.busy():
+            others = [asyncio.create_task(batcher.step(make_step(OTHER))) for _ in range(3)]
+            await asyncio.to_thread(model.wait_until_entered)
+            others.append(asyncio.create_task(batcher.step(make_step(OTHER + 1))))
+            urgent = asyncio.create_task(live(batcher))
+            await asyncio.sleep(0)
+        await asyncio.gather(*others, urgent)
+    assert model.stepped == [OTHER, OTHER, OTHER, LIVE, OTHER + 1]
+
+
+async def test_a_step_that_would_be_in_the_way_of_a_live_frame_waits_for_it() -> None:
+    clock = ManualClock()
+    model = TimedModel(clock)
+    async with make_batcher(model, clock=clock) as batcher:
+        await batcher.step(make_step(OTHER))  # how long it takes is known from now on
+        for _ in range(3):  # ten a second, busy for 0.08 s of each 0.1
+            await live(batcher)
+            clock.advance(0.1 - STEP_S)
+        clock.advance(-0.01)
+        other = asyncio.create_task(batcher.step(make_step(OTHER + 1)))
+        await asyncio.sleep(0.02)
+        assert not other.done()
+        clock.advance(0.01)
+        await live(batcher)
+        clock.advance(3.0)  # the live stream has ended
+        await asyncio.wait_for(other, 5.0)
+    assert model.stepped == [OTHER, LIVE, LIVE, LIVE, LIVE, OTHER + 1]
+
+
+async def test_a_free_lane_is_not_for_others_while_a_live_step_is_in_the_model() -> None:
+    model = RecallModel(lanes=2)
+    async with make_batcher(model) as batcher:
+        with model.busy():
+            urgent = asyncio.create_task(live(batcher))
+            await asyncio.to_thread(model.wait_until_entered)
+            other = asyncio.create_task(batcher.step(make_step(OTHER)))
+            await asyncio.sleep(0.02)
+            assert model.batches == [1]
+            model.batches.clear()
+        await asyncio.wait_for(asyncio.gather(urgent, other), 1.0)
+    assert model.batches == [1]
+
+
+async def test_a_live_step_takes_the_free_lane_beside_another() -> None:
+    model = RecallModel(lanes=2)
+    async with make_batcher(model) as batcher:
+        with model.busy():
+            other = asyncio.create_task(batcher.step(make_step(OTHER)))
+            await asyncio.to_thread(model.wait_until_entered)
+            urgent = asyncio.create_task(live(batcher))
+            await asyncio.to_thread(model.wait_until_entered)
+        await asyncio.gather(urgent, other)
+
+
+async def test_a_step_that_fits_into_the_gap_is_taken_at_once() -> None:
+    clock = ManualClock()
+    async with make_batcher(TimedModel(clock), clock=clock) as batcher:
+        await batcher.step(make_step(OTHER))
+        for _ in range(3):
+            await live(batcher)
+            clock.advance(0.5 - STEP_S)
+        await live(batcher)
+        await asyncio.wait_for(batcher.step(make_step(OTHER)), 0.2)
+
+
+async def test_no_step_waits_for_ever() -> None:
+    clock = ManualClock()
+    model = TimedModel(clock)
+    async with make_batcher(model, clock=clock) as batcher:
+        await batcher.step(make_step(OTHER))
+        await live(batcher)
+        other = asyncio.create_task(batcher.step(make_step(OTHER + 1)))
+        for _ in range(40):  # a live stream that leaves no gap
+            await live(batcher)
+            await asyncio.sleep(0)
+            if other.done():
+                break
+        await other
+    taken = model.stepped.index(OTHER + 1)
+    assert 20 < taken < 35, "expected it after two seconds of live steps"
+
+
+def test_a_rhythm_is_learned_and_forgotten() -> None:
+    rhythm = LiveRhythm()
+    rhythm.arrived("a", 1.0)
+    assert rhythm.next_due(1.0) is None
+    rhythm.arrived("a", 1.5)
+    assert rhythm.next_due(1.5) == Due(2.0, 2.25)
+    rhythm.arrived("b", 1.5)
+    rhythm.arrived("b", 1.6)
+    assert rhythm.next_due(1.6) == Due(1.6 + (1.6 - 1.5), 1.6 + 1.5 * (1.6 - 1.5))
+    assert rhythm.next_due(1.9) == Due(2.0, 2.25), "b has stopped"
+    assert rhythm.next_due(2.3) is None, "both have"
+    rhythm.answered("a", 2.4)
+    assert rhythm.next_due(2.4) == Due(2.0, 2.65), "a was kept waiting and could not send"

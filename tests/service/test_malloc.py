@@ -1,0 +1,28 @@
+"""What is freed is used again, and not faulted in anew for every frame."""
+
+import subprocess
+import sys
+
+FRAMES = 20
+SCRIPT = f"""
+import resource
+import numpy as np
+from vergence_service.malloc import keep_freed_memory
+
+assert keep_freed_memory()
+
+def faults_of_frames():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range({FRAMES}):
+        pieces = [np.ones(3_000_000, np.uint8) for _ in range(4)]
+        del pieces
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+faults_of_frames()
+print(faults_of_frames())
+"""
+
+
+def test_frames_are_not_faulted_in_again() -> None:
+    run = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True)
+    assert int(run.stdout) < FRAMES  # every frame has some 3,000 pages
