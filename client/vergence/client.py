@@ -1,6 +1,5 @@
 """The way in: one client per server, any number of sessions on it."""
 
-import re
 import uuid
 from collections.abc import Callable
 from typing import Self
@@ -10,14 +9,11 @@ from vergence.results import SessionEvent
 from vergence.session import DepthSession
 from vergence.transports.addresses import connector, on_this_machine
 from vergence_proto import codec
-from vergence_proto.errors import BadShape
 from vergence_proto.geometry import Axes, RectifiedRig
-from vergence_proto.types import Delivery, ImageEncoding, OutputFormat, StereoRig
+from vergence_proto.types import Delivery, ImageEncoding, OutputFormat, StereoRig, checked_stream_id
 from vergence_proto.v1 import depth_pb2 as pb
 
 DEFAULT_SERVER = "grpc://127.0.0.1:50051"
-
-_STREAM_ID = re.compile(r"[A-Za-z0-9._-]{1,128}")
 
 
 class DepthClient:
@@ -88,7 +84,7 @@ class DepthClient:
         Quota, StreamLimit, StateMemory, Draining, NotReady.
         """
         opening = pb.OpenStream(
-            stream_id=_checked_id(uuid.uuid4().hex if stream_id is None else stream_id),
+            stream_id=checked_stream_id(uuid.uuid4().hex if stream_id is None else stream_id),
             resume_token=resume_token,
             rig=codec.rig_to_proto(
                 StereoRig.from_rectified(rig) if isinstance(rig, RectifiedRig) else rig
@@ -125,12 +121,3 @@ class DepthClient:
         """End a stream, whoever holds it, and free its state. Raises UnknownStream."""
         request = pb.CloseStreamRequest(stream_id=stream_id)
         await self._transport.ask("CloseStream", request, pb.CloseStreamResponse)
-
-
-def _checked_id(stream_id: str) -> str:
-    # Before it is sent: it travels in a header, which cannot carry every character.
-    if not _STREAM_ID.fullmatch(stream_id):
-        raise BadShape(
-            f"expected a stream id of 1 to 128 characters of A-Z a-z 0-9 . _ -, got {stream_id!r}"
-        )
-    return stream_id

@@ -3,17 +3,20 @@
 They are made by the codec or by a reader, which check them; below those nothing is checked again.
 """
 
+import re
 from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vergence_proto.errors import BadCalibration
+from vergence_proto.errors import BadCalibration, BadShape
 from vergence_proto.geometry import Pose, RectifiedRig
 
 Image = NDArray[np.uint8]  # [H, W, 3], RGB
 Plane = NDArray[np.float32]  # [H, W]; NaN where there is no value
+
+_STREAM_ID = re.compile(r"[A-Za-z0-9._-]{1,128}")
 
 # Two cameras count as rectified if no pixel would move by more than a few hundredths.
 _RECTIFIED_TOLERANCE = 1e-6
@@ -236,3 +239,13 @@ class DisparityMap:
     @property
     def valid(self) -> NDArray[np.bool_]:
         return np.isfinite(self.disparity_px)
+
+
+def checked_stream_id(stream_id: str) -> str:
+    """Return the id unchanged. Raises BadShape: it could not travel in a header or a URL."""
+    if not _STREAM_ID.fullmatch(stream_id):
+        raise BadShape(
+            "expected a stream id of 1 to 128 characters of A-Z a-z 0-9 . _ -, "
+            f"got {stream_id[:200]!r}"
+        )
+    return stream_id

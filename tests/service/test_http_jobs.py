@@ -22,7 +22,7 @@ from tests.support.http import (
 from tests.support.models import RAISES, RecallModel
 from tests.support.sequences import make_frames, sequence_files, zip_bytes
 from tests.support.server import raw_stream, running_server
-from vergence_service.jobs.job import JobState
+from vergence_proto.jobs import JobState
 from vergence_service.jobs.store import JobStore
 
 ARCHIVE = zip_bytes(sequence_files(make_frames(6)))

@@ -2,7 +2,6 @@
 
 import asyncio
 from collections.abc import Callable
-from enum import StrEnum
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated
@@ -17,6 +16,7 @@ from vergence.cli.errors import Trouble
 from vergence.cli.run import run
 from vergence.client import DEFAULT_SERVER, DepthClient
 from vergence_proto.errors import DepthError
+from vergence_proto.jobs import Output, ResultFormat
 
 app = typer.Typer(
     help="Live stereo depth over the network.",
@@ -29,19 +29,6 @@ app = typer.Typer(
 # imports would otherwise slow every command down, or break it where they are missing.
 _CONTRIBUTED = "vergence.commands"
 _ABOUT = {"serve": "Serve depth over gRPC, with health and metrics over HTTP."}
-
-
-class ResultForm(StrEnum):
-    PNG16 = "png16"
-    PFM = "pfm"
-    NPZ = "npz"
-    MP4 = "mp4"
-
-
-class OutputKind(StrEnum):
-    DISPARITY = "disparity"
-    DEPTH = "depth"
-    CONFIDENCE = "confidence"
 
 
 JsonOption = Annotated[
@@ -147,11 +134,11 @@ def _batch(
     ] = None,
     out: Annotated[Path, typer.Option(help="Results go to OUT/NAME.")] = Path("vergence-batch"),
     form: Annotated[
-        ResultForm, typer.Option("--format", help="Of the results; mp4 is for looking at.")
-    ] = ResultForm.PNG16,
+        ResultFormat, typer.Option("--format", help="Of the results; mp4 is for looking at.")
+    ] = ResultFormat.PNG16,
     output: Annotated[
-        list[OutputKind], typer.Option(help="Of every frame; may be given more than once.")
-    ] = [OutputKind.DISPARITY],  # noqa: B006  typer copies it
+        list[Output], typer.Option(help="Of every frame; may be given more than once.")
+    ] = [Output.DISPARITY],  # noqa: B006  typer copies it
     iterations: Annotated[
         int, typer.Option(min=0, help="Refinements a frame; 0: the server's default.")
     ] = 0,

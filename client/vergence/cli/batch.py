@@ -20,6 +20,7 @@ from vergence.cli.play import progress_bar, write_json
 from vergence.cli.sequence_jobs import Job, Query, SequenceService
 from vergence.cli.uploads import Upload, find_uploads
 from vergence_proto.errors import DepthError
+from vergence_proto.jobs import JobState
 
 # Packed and sent at once; the server runs them one after the other.
 _AT_ONCE = 3
@@ -86,7 +87,7 @@ async def _send(
                     bar = progress.add_task(upload.name, total=None, note="uploading")
                     try:
                         job = await _run(service, upload, Path(scratch), query, progress, bar)
-                        if job["state"] == "failed":
+                        if JobState(job["state"]) is JobState.FAILED:
                             return Outcome(upload.name, job, f"{job['reason']}: {job['message']}")
                         await service.fetch(job, form, out / upload.name)
                         await service.forget(job)

@@ -49,7 +49,7 @@ async def run(
     rate_hz = _rate_hz(rate, source)
     directory = out or Path("vergence-run") / source.name
     directory.mkdir(parents=True, exist_ok=True)
-    alone = source.fps is None and len(source) == 1
+    alone = source.is_single_pair
     async with (
         server_for(server, console) as address,
         DepthClient(address) as client,

@@ -13,6 +13,7 @@ import httpx
 
 from vergence.cli.errors import Trouble
 from vergence_proto.errors import DepthError, error_from_wire
+from vergence_proto.jobs import JobState
 
 # A server that is restarted is back within this.
 _PATIENCE_S = 60.0
@@ -53,7 +54,7 @@ class SequenceService:
         """The job, again and again, until it has ended."""
         while True:
             yield job
-            if job["state"] in ("done", "failed"):
+            if JobState(job["state"]).ended:
                 return
             await asyncio.sleep(_ASK_EVERY_S)
             ask = partial(self.http.get, f"/v1/sequences/{job['id']}")

@@ -66,6 +66,11 @@ class StereoSource:
     # in) or in units of the data set's own. Disparity is as good as ever.
     metric: bool = True
 
+    @property
+    def is_single_pair(self) -> bool:
+        """Whether this is one pair on its own and not one frame of a sequence."""
+        return self.fps is None and len(self) == 1
+
     def __len__(self) -> int:
         return len(self.files)
 

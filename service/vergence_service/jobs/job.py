@@ -3,23 +3,9 @@
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from enum import StrEnum
 from typing import Any
 
-
-class JobState(StrEnum):
-    QUEUED = "queued"
-    RUNNING = "running"
-    DONE = "done"
-    FAILED = "failed"
-
-
-class Output(StrEnum):
-    """What a result holds of every frame."""
-
-    DISPARITY = "disparity"
-    DEPTH = "depth"
-    CONFIDENCE = "confidence"
+from vergence_proto.jobs import JobState, Output
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,7 +37,7 @@ class Job:
 
     @property
     def ended(self) -> bool:
-        return self.state in (JobState.DONE, JobState.FAILED)
+        return self.state.ended
 
 
 def job_to_json(job: Job) -> str:

@@ -15,7 +15,8 @@ from vergence_proto.errors import (
     Quota,
     SequenceNotDone,
 )
-from vergence_service.jobs.job import Job, JobOptions, JobState
+from vergence_proto.jobs import JobState
+from vergence_service.jobs.job import Job, JobOptions
 from vergence_service.jobs.registry import JobShelf
 from vergence_service.jobs.results import result_bytes
 from vergence_service.jobs.run import opening_of

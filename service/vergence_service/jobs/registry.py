@@ -9,7 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from vergence_proto.errors import QueueFull, UnknownSequence, UploadTooLarge
-from vergence_service.jobs.job import Job, JobState
+from vergence_proto.jobs import JobState
+from vergence_service.jobs.job import Job
 from vergence_service.jobs.store import JobStore, folder_bytes
 
 

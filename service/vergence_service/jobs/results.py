@@ -17,7 +17,6 @@ import tempfile
 import zipfile
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -27,20 +26,13 @@ from numpy.typing import NDArray
 
 from vergence_proto.datasets import StereoSource, encode_disparity_png, encode_pfm
 from vergence_proto.geometry import RectifiedRig
+from vergence_proto.jobs import Output, ResultFormat
 from vergence_proto.types import DisparityMap, Plane
-from vergence_service.jobs.job import Output
 
 _RIG = "rig.json"
 _CHUNK = 1 << 20
 # Of the colours: all but the nearest and farthest hundredth of the first frame's disparities.
 _COLOUR_RANGE_PCT = (1, 99)
-
-
-class ResultFormat(StrEnum):
-    PNG16 = "png16"  # 16-bit PNG, x256, 0 = none, as KITTI does; confidence 8-bit
-    PFM = "pfm"
-    NPZ = "npz"
-    MP4 = "mp4"  # disparity in colours, to look at
 
 
 class CannotEncode(RuntimeError):

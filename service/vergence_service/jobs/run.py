@@ -9,9 +9,10 @@ from pathlib import Path
 
 from vergence_proto.accuracy import Accuracy, accuracy
 from vergence_proto.datasets import LayoutError, StereoSource
+from vergence_proto.jobs import Output
 from vergence_proto.types import Delivery, OutputFormat
 from vergence_service.jobs.checkpoints import Checkpoint, read_checkpoint, write_checkpoint
-from vergence_service.jobs.job import Job, JobOptions, Output
+from vergence_service.jobs.job import Job, JobOptions
 from vergence_service.jobs.results import holds_frames, start_result, write_frame
 from vergence_service.jobs.sources import open_below, sequence_error, without_truth
 from vergence_service.jobs.stepping import Stepped, step_all
@@ -46,13 +47,12 @@ def opening_of(source: StereoSource, options: JobOptions) -> Opening:
 
     The iterations of a lone pair are those of its cold start, as in ``vergence run``.
     """
-    alone = source.fps is None and len(source) == 1
     return Opening(
         source.rig,
         delivery=Delivery.EVERY,
         output=OutputFormat(confidence=Output.CONFIDENCE in options.outputs),
         iterations=options.iterations,
-        cold_iterations=options.iterations if alone else 0,
+        cold_iterations=options.iterations if source.is_single_pair else 0,
     )
 
 

@@ -18,7 +18,8 @@ import threading
 from pathlib import Path
 from typing import Self
 
-from vergence_service.jobs.job import Job, JobState, job_from_json, job_to_json
+from vergence_proto.jobs import JobState
+from vergence_service.jobs.job import Job, job_from_json, job_to_json
 
 
 class StoreUnavailable(OSError):

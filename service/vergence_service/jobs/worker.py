@@ -7,7 +7,8 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 
 from vergence_proto.errors import DepthError, Draining, ModelFailed, NotReady
-from vergence_service.jobs.job import Job, JobState
+from vergence_proto.jobs import JobState
+from vergence_service.jobs.job import Job
 from vergence_service.jobs.registry import JobShelf
 from vergence_service.jobs.run import Progress, run_job
 from vergence_service.streams.engine import DepthEngine

@@ -1,7 +1,6 @@
 """The open streams: who has them, within which limits, and when they end."""
 
 import hmac
-import re
 import secrets
 from collections.abc import Callable, Iterable
 
@@ -9,7 +8,6 @@ import numpy as np
 
 from vergence_proto.errors import (
     BadCalibration,
-    BadShape,
     Quota,
     StateMemory,
     StreamExists,
@@ -18,15 +16,13 @@ from vergence_proto.errors import (
     Superseded,
     UnknownStream,
 )
-from vergence_proto.types import Origin, StereoRig
+from vergence_proto.types import Origin, StereoRig, checked_stream_id
 from vergence_service.metrics import Metrics
 from vergence_service.streams.rectify import Rectifier
 from vergence_service.streams.stream import Attachment, Notice, NoticeKind, Opening, Stream
 
 # How long an expired stream is told apart from one that never was.
 _TOMBSTONE_S = 300.0
-
-_STREAM_ID = re.compile(r"[A-Za-z0-9._-]{1,128}")
 
 
 class StreamTable:
@@ -77,11 +73,7 @@ class StreamTable:
         """
         self.sweep()
         stream_id = stream_id or f"s-{secrets.token_hex(8)}"
-        if not _STREAM_ID.fullmatch(stream_id):
-            raise BadShape(
-                f"expected a stream id of 1 to 128 characters of A-Z a-z 0-9 . _ -, "
-                f"got {stream_id[:200]!r}"
-            )
+        checked_stream_id(stream_id)
         if stream_id in self._streams:
             raise StreamExists(
                 f"stream {stream_id!r} is open; resume it with its token, close it, or choose "

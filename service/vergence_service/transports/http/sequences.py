@@ -11,9 +11,10 @@ from fastapi.responses import JSONResponse, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from vergence_proto.errors import BadShape, ErrorCode, NotReady, UnknownSequence
-from vergence_service.jobs.job import JobOptions, JobState, Output
+from vergence_proto.jobs import JobState, Output, ResultFormat
+from vergence_service.jobs.job import JobOptions
 from vergence_service.jobs.queue import JobQueue, JobStatus
-from vergence_service.jobs.results import CannotEncode, ResultFormat, mp4_of, zip_of
+from vergence_service.jobs.results import CannotEncode, mp4_of, zip_of
 from vergence_service.transports.http.errors import PROBLEM_RESPONSE
 from vergence_service.transports.http.uploads import (
     ARCHIVE_TYPES,

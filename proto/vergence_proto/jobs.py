@@ -1,0 +1,39 @@
+"""What client and server both say about jobs: whole sequences that are sent over HTTP."""
+
+from enum import StrEnum
+
+
+class JobState(StrEnum):
+    """The state of a job, as the HTTP API writes it."""
+
+    QUEUED = "queued"
+    RUNNING = "running"
+    DONE = "done"
+    FAILED = "failed"
+
+    @property
+    def ended(self) -> bool:
+        """Whether the job is finished, with or without success."""
+        return self in (JobState.DONE, JobState.FAILED)
+
+
+class Output(StrEnum):
+    """One kind of map that a result holds for every frame."""
+
+    DISPARITY = "disparity"
+    DEPTH = "depth"
+    CONFIDENCE = "confidence"
+
+
+class ResultFormat(StrEnum):
+    """The file format of a job's result."""
+
+    PNG16 = "png16"
+    """16-bit PNG: disparity times 256, 0 where there is no value (the KITTI convention);
+    confidence as 8-bit PNG."""
+    PFM = "pfm"
+    """Portable float map, 32-bit floats."""
+    NPZ = "npz"
+    """One NumPy archive per frame."""
+    MP4 = "mp4"
+    """A film of coloured disparity, for viewing only."""
