@@ -28,14 +28,16 @@ def main() -> None:
         "rig": sample.rig,
         "world_from_left": first.pose,
     }
-    with asyncio.Runner() as runner:
-        for source in json.loads(Path(sys.argv[1]).read_text()):
-            flags = ast.PyCF_ALLOW_TOP_LEVEL_AWAIT
-            code = compile(source, "a block of the page", "exec", flags=flags)
-            if code.co_flags & inspect.CO_COROUTINE:
-                runner.run(eval(code, names))
-            else:
-                exec(code, names)
+    # One loop for the pages' own ``await``; a block that starts a loop itself is not inside it.
+    loop = asyncio.new_event_loop()
+    for source in json.loads(Path(sys.argv[1]).read_text()):
+        flags = ast.PyCF_ALLOW_TOP_LEVEL_AWAIT
+        code = compile(source, "a block of the page", "exec", flags=flags)
+        if code.co_flags & inspect.CO_COROUTINE:
+            loop.run_until_complete(eval(code, names))
+        else:
+            exec(code, names)
+    loop.close()
 
 
 if __name__ == "__main__":
