@@ -69,7 +69,8 @@ class DepthClient:
         iterations, cold_iterations
             Refinements of a warm step and of a cold start; 0: the server's defaults.
         weights_sha256
-            The weights that results must come from (:attr:`ModelInfo.weights_sha256`), where they
+            The weights that results must come from
+            (:attr:`vergence.ModelInfo.weights_sha256`), where they
             must be comparable; default: whatever the server runs, and the same after a resume.
         encoding
             How images travel: RAW is exact and costs bandwidth, PNG is exact and costs time.

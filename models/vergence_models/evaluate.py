@@ -33,7 +33,7 @@ from vergence_models.evaluation.stepping import (
     footage_from_source,
 )
 from vergence_models.training.validation import filmed
-from vergence_proto.datasets import LayoutError, find_sources, open_source
+from vergence_proto.datasets import DatasetError, find_sources, open_source
 from vergence_proto.model_io import ManifestError
 
 WEIGHTS = Path(__file__).parent / "weights"
@@ -58,7 +58,7 @@ def methods_for(network: SteppedNetwork, *, thorough: bool) -> list[Method]:
 
 
 def footage_on_disk(sources: list[str]) -> Iterator[Footage]:
-    """Each source, as ``find_sources`` lists them. Raises LayoutError."""
+    """Each source, as ``find_sources`` lists them. Raises DatasetError."""
     for source in sources:
         yield footage_from_source(open_source(source))
 
@@ -187,7 +187,7 @@ def main(arguments: list[str] | None = None) -> None:
             methods_for(network, thorough=given.thorough),
             gather(sources, given.pool, given.clips),
         )
-    except (ManifestError, LayoutError, FileNotFoundError) as error:
+    except (ManifestError, DatasetError, FileNotFoundError) as error:
         sys.exit(f"vergence_models.evaluate: {error}")
     sys.stdout.write(markdown(results))
     if given.json:

@@ -7,14 +7,14 @@ import pytest
 
 from tests.support import dataset_trees as trees
 from tests.support.sources import assert_images, assert_poses, assert_truth, rig_of
-from vergence_proto.datasets import LAYOUTS, find_sources, open_source
+from vergence_proto.datasets import DATASETS, find_sources, open_source
 from vergence_proto.geometry import RectifiedRig
 
 OPTIONS = {"sceneflow": "?fx=20"}
 
 
 def test_every_layout_has_a_tree_here() -> None:
-    assert set(trees.TREES) == set(LAYOUTS)
+    assert set(trees.TREES) == set(DATASETS)
 
 
 @pytest.mark.parametrize("kind", trees.TREES)

@@ -21,7 +21,7 @@ from vergence.cli.local_server import local_server
 from vergence.cli.pictures import Row, sheet
 from vergence.cli.streaming import Answered
 from vergence_proto.accuracy import Accuracy, accuracy
-from vergence_proto.datasets import LayoutError, StereoSource, open_source
+from vergence_proto.datasets import DatasetError, StereoSource, open_source
 from vergence_proto.types import Origin
 
 _SHEET_ROWS = 4
@@ -31,7 +31,7 @@ def source_at(text: str) -> StereoSource:
     """Open ``KIND:PATH``. Raises Trouble: it is not there, or not what it should be."""
     try:
         source = open_source(text)
-    except LayoutError as error:
+    except DatasetError as error:
         raise Trouble(str(error), exit_code=2) from None
     if len(source) == 0:
         raise Trouble(f"{text}: no frames", exit_code=2)

@@ -26,7 +26,7 @@ from vergence.cli.streaming import Answered, every_frame, live_frames
 from vergence.client import DepthClient
 from vergence.session import DepthSession
 from vergence_proto.accuracy import Accuracy
-from vergence_proto.datasets import LayoutError, StereoSource, read_ahead, write_disparity_png
+from vergence_proto.datasets import DatasetError, StereoSource, read_ahead, write_disparity_png
 from vergence_proto.types import Delivery
 
 # Files being written while the next frames are stepped.
@@ -64,7 +64,7 @@ async def run(
         written = _Written(directory, alone=alone, kept=shown_in_sheet(len(source)))
         try:
             report = await _stream(session, source, rate_hz, written, console)
-        except LayoutError as error:  # a file in the middle of the sequence
+        except DatasetError as error:  # a file in the middle of the sequence
             raise Trouble(str(error), exit_code=2) from None
     if pictures and written.rows:
         write_sheet(directory / "sheet.png", title, written.rows)

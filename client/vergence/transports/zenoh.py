@@ -11,8 +11,8 @@ from vergence.transports.base import Answer, Call, ConnectionLost
 from vergence.transports.zenoh_call import ServerInfos, ZenohCall
 from vergence_proto.errors import DepthError, StreamExpired, UnknownStream
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_proto.zenoh.keys import ANY, UNARY_KEYS, ask_key
-from vergence_proto.zenoh.session import ZenohPeer, make_config, reason_of
+from vergence_proto.zenoh.keys import ANY, UNARY_KEYS, query_key
+from vergence_proto.zenoh.session import ZenohSession, make_config, reason_of
 
 _ASK_TIMEOUT_S = 1.5  # a server that has not answered by then is as good as none
 _CONNECT_TIMEOUT_MS = 1000
@@ -30,7 +30,7 @@ class ZenohTransport:
         self._endpoint = endpoint
         self._namespace = namespace
         self._config = config
-        self._peer: ZenohPeer | None = None
+        self._peer: ZenohSession | None = None
         self._closed = False
         self._turn = asyncio.Lock()
         self._calls: dict[str, ZenohCall] = {}  # by stream, the latest of each that is not over
@@ -61,7 +61,7 @@ class ZenohTransport:
             if peer is not None:
                 await peer.close()
 
-    async def _connected(self) -> ZenohPeer:
+    async def _connected(self) -> ZenohSession:
         async with self._turn:
             if self._closed:
                 raise RuntimeError("the client was closed")
@@ -74,7 +74,7 @@ class ZenohTransport:
                     connect__timeout_ms=_CONNECT_TIMEOUT_MS,
                     scouting__multicast__enabled=False,  # whatever the file says of it
                 )
-                peer = ZenohPeer(config)
+                peer = ZenohSession(config)
                 try:
                     await peer.open()
                 except zenoh.ZError as error:
@@ -118,9 +118,9 @@ class ZenohTransport:
         Raises the error that says most, if none does; ConnectionLost: there is no server.
         """
         peer = await self._connected()
-        key = ask_key(self._namespace, ANY, UNARY_KEYS[method])
+        key = query_key(self._namespace, ANY, UNARY_KEYS[method])
         try:
-            answers = await peer.ask(key, question, timeout_s=_ASK_TIMEOUT_S)
+            answers = await peer.query(key, question, timeout_s=_ASK_TIMEOUT_S)
         except zenoh.ZError as error:
             raise self._lost(error) from None
         refusals = [each.error for each in answers if each.error is not None]

@@ -23,8 +23,8 @@ from vergence_proto.errors import (
 )
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.zenoh.inbox import Inbox
-from vergence_proto.zenoh.keys import ANY, OPEN, StreamKeys, ask_key, server_key
-from vergence_proto.zenoh.session import Undeclarable, ZenohPeer, reason_of
+from vergence_proto.zenoh.keys import ANY, OPEN, StreamKeys, query_key, server_key
+from vergence_proto.zenoh.session import Declaration, ZenohSession, reason_of
 
 ServerInfos = dict[str, pb.GetServerInfoResponse]  # by server id, best first
 
@@ -46,7 +46,7 @@ class ZenohCall:
 
     def __init__(
         self,
-        peer: ZenohPeer,
+        peer: ZenohSession,
         namespace: str,
         stream_id: str,
         find_servers: Callable[[bool], Awaitable[ServerInfos]],
@@ -60,9 +60,9 @@ class ZenohCall:
         self._find_servers = find_servers
         self._attachment_id = secrets.token_hex(8)
         self._inbox = Inbox(
-            self._attachment_id, bulky=pb.DisparityMap, room=_WAITING_MAPS, displaces=True
+            self._attachment_id, bulky=pb.DisparityMap, max_bulky=_WAITING_MAPS, drop_oldest=True
         )
-        self._declared: list[Undeclarable] = []
+        self._declared: list[Declaration] = []
         self._ready: deque[pb.StreamDepthResponse] = deque()
         self._live = True
         self._max_frame_bytes = 0
@@ -127,13 +127,13 @@ class ZenohCall:
         declared.append(await peer.subscribe(self._keys.disparity, self._inbox.put))
         declared.append(await peer.subscribe(self._keys.status, self._inbox.put))
         declared.append(
-            await peer.watch_deaths(server_key(self._namespace, ANY), self._server_died)
+            await peer.watch_liveliness(server_key(self._namespace, ANY), self._server_died)
         )
-        declared.append(await peer.declare_alive(self._keys.client(self._attachment_id)))
+        declared.append(await peer.declare_liveliness(self._keys.client(self._attachment_id)))
         refusal: DepthError = ConnectionLost("no server answers")
         for self.server_id, info in servers.items():
-            key = ask_key(self._namespace, self.server_id, OPEN)
-            answers = await peer.ask(
+            key = query_key(self._namespace, self.server_id, OPEN)
+            answers = await peer.query(
                 key, opening, timeout_s=_OPEN_TIMEOUT_S, attachment_id=self._attachment_id
             )
             if not answers:
@@ -143,7 +143,7 @@ class ZenohCall:
             if error is None:
                 self._max_frame_bytes = info.max_message_bytes
                 opened = pb.StreamOpened.FromString(answers[0].payload)
-                self._inbox.put_own(pb.StreamDepthResponse(opened=opened))
+                self._inbox.put_local(pb.StreamDepthResponse(opened=opened))
                 return
             refusal = error
             if not isinstance(error, _NO_ROOM):
@@ -161,7 +161,7 @@ class ZenohCall:
                 f"expected a frame of at most {self._max_frame_bytes} bytes, got {size}"
             )
             refusal = codec.error_to_frame_error(frame.frame_id, error)
-            self._inbox.put_own(pb.StreamDepthResponse(frame_error=refusal))
+            self._inbox.put_local(pb.StreamDepthResponse(frame_error=refusal))
             return
         self._unanswered.sent(frame.frame_id)
         await self._put(frame, may_drop=self._live)

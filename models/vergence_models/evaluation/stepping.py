@@ -15,7 +15,7 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from vergence_models.data.clips import StereoClips
-from vergence_proto.datasets import LayoutError, StereoSource
+from vergence_proto.datasets import DatasetError, StereoSource
 from vergence_proto.geometry import Pose, RectifiedRig, uvd_curr_from_prev
 from vergence_proto.model_io import ModelCard, Stages, load_model_card
 
@@ -43,10 +43,10 @@ class Footage:
 
 
 def footage_from_source(source: StereoSource) -> Footage:
-    """Read a whole source. Raises LayoutError: it is not rectified, or a file is wrong."""
+    """Read a whole source. Raises DatasetError: it is not rectified, or a file is wrong."""
     rig = source.rig.as_rectified()
     if rig is None:
-        raise LayoutError(f"{source.name}: expected a rectified rig to evaluate on")
+        raise DatasetError(f"{source.name}: expected a rectified rig to evaluate on")
     views = []
     for entry in source:
         truth = entry.truth_px

@@ -45,7 +45,7 @@ def in_stages(
 
 
 def handed_on(parts: Parts[ModelProto]) -> list[list[ValueInfoProto]]:
-    """What each graph of ``begin`` gives, as :func:`stitched` names it."""
+    """The outputs of each graph of ``begin``, as ``stitch.stitched`` names them."""
     return [
         [renamed(entry, f"begin_{number}.{entry.name}") for entry in part.graph.output]
         for number, part in enumerate(parts.begin)

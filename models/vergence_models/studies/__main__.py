@@ -38,7 +38,7 @@ from vergence_models.studies.tables import (
     write_tables,
 )
 from vergence_models.training.runs import RunError
-from vergence_proto.datasets import LayoutError
+from vergence_proto.datasets import DatasetError
 from vergence_proto.model_io import ManifestError
 
 log = logging.getLogger("vergence_models.studies")
@@ -128,7 +128,7 @@ def main(arguments: list[str] | None = None) -> None:
     except (
         ConfigError,
         FileNotFoundError,
-        LayoutError,
+        DatasetError,
         ManifestError,
         RunError,
         StudyFileError,

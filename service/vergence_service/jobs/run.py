@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from vergence_proto.accuracy import Accuracy, accuracy
-from vergence_proto.datasets import LayoutError, StereoSource
+from vergence_proto.datasets import DatasetError, StereoSource
 from vergence_proto.jobs import Output
 from vergence_proto.types import Delivery, OutputFormat
 from vergence_service.jobs.checkpoints import Checkpoint, read_checkpoint, write_checkpoint
@@ -103,7 +103,7 @@ async def run_job(
                 writing.append((stepped, asyncio.create_task(keep)))
         while writing:
             await settle()
-    except LayoutError as error:
+    except DatasetError as error:
         raise sequence_error(error, folder / "input") from None
     finally:
         # Nothing is written any more once this has returned, so the folder can be removed.

@@ -4,8 +4,8 @@ import dataclasses
 from pathlib import Path
 
 from vergence_proto.datasets import (
-    LAYOUTS,
-    LayoutError,
+    DATASETS,
+    DatasetError,
     StereoSource,
     find_sources,
     open_source,
@@ -30,17 +30,17 @@ def find_sequence(folder: Path, wanted: str | None) -> str:
         open_below(folder, wanted)
         return wanted
     found, trouble = [], []
-    for kind in LAYOUTS:
+    for kind in DATASETS:
         for spec in find_sources(f"{kind}:{folder}"):
             try:
                 open_source(spec)
-            except LayoutError as error:
+            except DatasetError as error:
                 trouble.append(_relative(str(error), folder))
             else:
                 found.append(_relative(spec, folder))
     if not found:
         why = f" ({trouble[0]})" if trouble else ""
-        raise BadSequence(f"expected a sequence in one of {', '.join(LAYOUTS)}, found none{why}")
+        raise BadSequence(f"expected a sequence in one of {', '.join(DATASETS)}, found none{why}")
     if len(found) > 1:
         named = ", ".join(found[:_NAMED_AT_MOST])
         raise BadSequence(f"expected one sequence; take one with source=KIND:PATH: {named}")
@@ -58,14 +58,14 @@ def open_below(folder: Path, spec: str) -> StereoSource:
         raise BadSequence(f"expected a path below the upload's own folder, got {spec!r}")
     try:
         source = open_source(f"{kind}:{folder}/{path}" if path else f"{kind}:{folder}")
-    except LayoutError as error:
+    except DatasetError as error:
         raise sequence_error(error, folder) from None
     if len(source) == 0:
         raise BadSequence(f"{spec}: no frames")
     return source
 
 
-def sequence_error(error: LayoutError, folder: Path) -> BadSequence:
+def sequence_error(error: DatasetError, folder: Path) -> BadSequence:
     """What was wrong with a file below ``folder``, without saying where the server keeps it."""
     return BadSequence(_relative(str(error), folder))
 

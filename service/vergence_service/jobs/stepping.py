@@ -41,7 +41,7 @@ async def step_all(
 
     Or every one from ``start`` on, whose predecessor left ``state``.
 
-    Raises what DepthEngine.open_apart and step_apart raise; LayoutError: a file cannot be read.
+    Raises what DepthEngine.open_apart and step_apart raise; DatasetError: a file cannot be read.
     """
     stream = await engine.open_apart(opening, state=state)
     frames = read_ahead(source, start=start)

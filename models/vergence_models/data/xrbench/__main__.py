@@ -16,7 +16,7 @@ from vergence_models.data.xrbench.recipe import KINDS, SETS, BadRecipe, Recipe
 from vergence_models.data.xrbench.sheet import contact_sheet
 from vergence_models.data.xrbench.tracer import VARIANTS, NoRenderer
 from vergence_models.data.xrbench.writer import PASSES, encode_png, render_sequence
-from vergence_proto.datasets import LayoutError
+from vergence_proto.datasets import DatasetError
 
 
 def _option(field: str, text: str) -> typer.models.OptionInfo:
@@ -78,7 +78,7 @@ def main(
         _render(recipes, out, chosen, variant, console)
         if sheet:
             sheet.write_bytes(encode_png(contact_sheet(out, recipes[-1].name, 0)))
-    except (BadRecipe, NoRenderer, LayoutError, OSError) as error:
+    except (BadRecipe, NoRenderer, DatasetError, OSError) as error:
         raise SystemExit(f"error: {error}") from None
     except KeyboardInterrupt:
         raise SystemExit("stopped; the same command goes on from here") from None

@@ -11,7 +11,7 @@ import numpy as np
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from vergence_proto.datasets import LayoutError, encode_disparity_png, read_image
+from vergence_proto.datasets import DatasetError, encode_disparity_png, read_image
 from vergence_proto.errors import BadCalibration, BadImage, BadShape, FrameTooLarge
 from vergence_proto.geometry import RectifiedRig
 from vergence_proto.types import Delivery, Image, Plane, StereoFrame, StereoRig
@@ -140,7 +140,7 @@ def _image(path: Path, name: str, max_pixels: int) -> Image:
         return read_image(path)
     except FrameTooLarge as error:
         raise FrameTooLarge(f"{name} image: {error}") from None
-    except (BadImage, LayoutError) as error:
+    except (BadImage, DatasetError) as error:
         raise BadImage(f"{name} image: {str(error).removeprefix(f'{path}: ')}") from None
 
 

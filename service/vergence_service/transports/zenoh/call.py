@@ -9,8 +9,8 @@ from google.rpc import status_pb2
 from vergence_proto.errors import Quota
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.zenoh.inbox import Inbox
-from vergence_proto.zenoh.keys import OPEN, StreamKeys, ask_key
-from vergence_proto.zenoh.session import Undeclarable, ZenohPeer
+from vergence_proto.zenoh.keys import OPEN, StreamKeys, query_key
+from vergence_proto.zenoh.session import Declaration, ZenohSession
 from vergence_service.transports.open_calls import OpenCalls
 from vergence_service.transports.zenoh.errors import status_of
 
@@ -25,7 +25,7 @@ class ZenohCall:
 
     def __init__(
         self,
-        peer: ZenohPeer,
+        peer: ZenohSession,
         query: zenoh.Query,
         opening: pb.OpenStream,
         *,
@@ -44,10 +44,10 @@ class ZenohCall:
         self._inbox = Inbox(
             attachment_id,
             bulky=pb.Frame,
-            room=1 if self._live else calls.limits.credit,
-            displaces=self._live,
+            max_bulky=1 if self._live else calls.limits.credit,
+            drop_oldest=self._live,
         )
-        self._subscription: Undeclarable | None = None
+        self._subscription: Declaration | None = None
         self._unanswered: set[int] = set()  # frame ids
         self._last_frame_id: int | None = None
 
@@ -119,7 +119,7 @@ class ZenohCall:
         self._subscription = await self._peer.subscribe(self._keys.frames, self._inbox.put)
         query, self._query = self._query, None
         assert query is not None
-        await self._peer.reply(query, ask_key(self._namespace, self._peer.id, OPEN), opened)
+        await self._peer.reply(query, query_key(self._namespace, self._peer.id, OPEN), opened)
 
     async def _send(self, key: str, message: Message) -> None:
         await self._peer.put(key, message, attachment_id=self._attachment_id, may_drop=self._live)

@@ -11,8 +11,8 @@ from google.protobuf.message import DecodeError, Message
 
 from vergence_proto.errors import BadShape
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_proto.zenoh.keys import ANY, OPEN, UNARY_KEYS, StreamKeys, ask_key, server_key
-from vergence_proto.zenoh.session import ZenohPeer, make_config, reason_of
+from vergence_proto.zenoh.keys import ANY, OPEN, UNARY_KEYS, StreamKeys, query_key, server_key
+from vergence_proto.zenoh.session import ZenohSession, make_config, reason_of
 from vergence_service.transports.errors import ZenohUnreachable
 from vergence_service.transports.open_calls import OpenCalls
 from vergence_service.transports.unary import UnaryMethods
@@ -61,7 +61,7 @@ class ZenohServer:
     ) -> None:
         self._calls = calls
         self._namespace = namespace
-        self._peer = ZenohPeer(config)
+        self._peer = ZenohSession(config)
         self._methods: Mapping[str, tuple[type[Message], Callable[[Any], Awaitable[Message]]]] = {
             UNARY_KEYS["GetServerInfo"]: (pb.GetServerInfoRequest, unary.server_info),
             UNARY_KEYS["GetStream"]: (pb.GetStreamRequest, unary.stream),
@@ -90,9 +90,9 @@ class ZenohServer:
         client_keys = StreamKeys(namespace, ANY).client(ANY)
         # Held for as long as this server serves: Zenoh ends what nobody refers to.
         self._declared = [
-            await peer.watch_deaths(client_keys, self._client_died),
-            await peer.answer_queries(ask_key(namespace, peer.id, ANY), self._asked),
-            await peer.declare_alive(server_key(namespace, peer.id)),
+            await peer.watch_liveliness(client_keys, self._client_died),
+            await peer.answer_queries(query_key(namespace, peer.id, ANY), self._asked),
+            await peer.declare_liveliness(server_key(namespace, peer.id)),
         ]
 
     async def drain(self, *, within_s: float) -> None:
@@ -148,7 +148,7 @@ class ZenohServer:
         except Exception as error:
             await self._peer.refuse(query, status_of(error))
         else:
-            await self._peer.reply(query, ask_key(self._namespace, self._peer.id, what), answer)
+            await self._peer.reply(query, query_key(self._namespace, self._peer.id, what), answer)
 
     def _start(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         task = asyncio.create_task(work)
