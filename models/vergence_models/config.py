@@ -79,20 +79,20 @@ class TrainingConfig:
     noise_m: float = 0.002
     clean_share: float = 0.3  # clips without the sensor's flaws
     reset_share: float = 0.1  # frames that lose their state
-    foreign_share: float = 0.1  # frames whose state is in part another clip's of the batch
+    cutmix_share: float = 0.1  # frames whose state is in part another clip's of the batch
     cold_iterations: int = 4  # at most, drawn anew for every frame without a state
     precision: Precision = Precision.FP32
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class Kind:
+class StepKind:
     """Of a step; as words, part of a file's name."""
 
     iterations: int
-    closer: int = 0  # of the iterations, the last ones, in cold steps alone
+    at_2x: int = 0  # of the iterations, the last ones, in cold steps alone
 
     def __str__(self) -> str:
-        return f"{self.iterations}_cold" if self.closer else str(self.iterations)
+        return f"{self.iterations}_cold" if self.at_2x else str(self.iterations)
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,8 +104,8 @@ class Config:
     training: TrainingConfig = field(default_factory=TrainingConfig)
     iterations: tuple[int, ...] = (1, 2, 4, 8)  # graphs to export
     # Cold starts with graphs of their own: how many of their iterations are a closer look.
-    closer: Mapping[int, int] = field(default_factory=dict)
-    closer_max_pixels: int = 1280 * 1024  # of an image; memory grows with the power of 1.5
+    iterations_at_2x: Mapping[int, int] = field(default_factory=dict)
+    max_pixels_at_2x: int = 1280 * 1024  # of an image; memory grows with the power of 1.5
 
 
 # Windows of a sharper camera need less blowing up; a stereo pair alone has to be good too, with
@@ -136,7 +136,7 @@ FAST_NETWORK = RaftNetworkConfig(
 CONFIGS = {
     config.name: config
     for config in (
-        Config("lite", LiteNetworkConfig(), LITE_TRAINING, closer={8: 2}),
+        Config("lite", LiteNetworkConfig(), LITE_TRAINING, iterations_at_2x={8: 2}),
         Config("full", RaftNetworkConfig(), RAFT_TRAINING, iterations=(1, 2, 5, 7, 20)),
         Config("fast", FAST_NETWORK, RAFT_TRAINING, iterations=(1, 2, 5, 7, 20)),
     )

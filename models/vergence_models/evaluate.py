@@ -23,7 +23,7 @@ from vergence_models.evaluation.methods import (
     with_pose_noise,
     without_poses,
 )
-from vergence_models.evaluation.metric_accumulator import Tally, settled_frame
+from vergence_models.evaluation.metric_accumulator import MetricAccumulator, settled_frame
 from vergence_models.evaluation.metrics import SHARES_PCT
 from vergence_models.evaluation.stepping import (
     Footage,
@@ -38,7 +38,7 @@ from vergence_proto.model_io import ManifestError
 
 WEIGHTS = Path(__file__).parent / "weights"
 
-Results = dict[str, dict[str, Tally]]  # group -> method -> its figures
+Results = dict[str, dict[str, MetricAccumulator]]  # group -> method -> its figures
 
 
 def methods_for(network: SteppedNetwork, *, thorough: bool) -> list[Method]:
@@ -48,8 +48,8 @@ def methods_for(network: SteppedNetwork, *, thorough: bool) -> list[Method]:
     methods = [warm, single_frame_method(network, name, most)]
     if thorough:
         methods += [
-            warm.told("no poses", without_poses),
-            warm.told(
+            warm.with_input("no poses", without_poses),
+            warm.with_input(
                 "poses off by 0.3 deg and 1 mm",
                 lambda footage: with_pose_noise(footage, deg=0.3, m=0.001),
             ),
@@ -84,9 +84,11 @@ def evaluate(methods: list[Method], footages: Iterator[tuple[str, Footage]]) -> 
     """Group -> method -> its figures."""
     results: Results = {}
     for group, footage in footages:
-        tallies = results.setdefault(group, {method.label: Tally() for method in methods})
+        accumulators = results.setdefault(
+            group, {method.label: MetricAccumulator() for method in methods}
+        )
         for method in methods:
-            tallies[method.label].add(footage, method.predict(footage))
+            accumulators[method.label].add(footage, method.predict(footage))
     return results
 
 
@@ -107,20 +109,20 @@ COLUMNS = {
 }
 
 
-def figures(tally: Tally) -> dict[str, float]:
+def figures(accumulator: MetricAccumulator) -> dict[str, float]:
     """The summary, and from which frame on a start has settled."""
-    settled = settled_frame(tally.epe_by_frame())
-    return tally.summary() | ({} if settled is None else {"settled": settled})
+    settled = settled_frame(accumulator.epe_by_frame())
+    return accumulator.summary() | ({} if settled is None else {"settled": settled})
 
 
 def markdown(results: Results) -> str:
     """One table per group."""
     parts = []
-    for group, tallies in results.items():
+    for group, accumulators in results.items():
         lines = [f"### {group}", "", "| method | " + " | ".join(COLUMNS.values()) + " |"]
         lines.append("|---|" + "---:|" * len(COLUMNS))
-        for name, tally in tallies.items():
-            found = figures(tally)
+        for name, accumulator in accumulators.items():
+            found = figures(accumulator)
             cells = [f"{found[key]:.3g}" if key in found else "" for key in COLUMNS]
             lines.append(f"| {name} | " + " | ".join(cells) + " |")
         parts.append("\n".join(lines))
@@ -130,10 +132,10 @@ def markdown(results: Results) -> str:
 def as_json(results: Results) -> dict[str, object]:
     return {
         group: {
-            name: {**figures(tally), "epe_by_frame": tally.epe_by_frame()}
-            for name, tally in tallies.items()
+            name: {**figures(accumulator), "epe_by_frame": accumulator.epe_by_frame()}
+            for name, accumulator in accumulators.items()
         }
-        for group, tallies in results.items()
+        for group, accumulators in results.items()
     }
 
 
@@ -145,12 +147,12 @@ def draw_plots(results: Results, folder: Path) -> None:
     from matplotlib import pyplot as plt
 
     folder.mkdir(parents=True, exist_ok=True)
-    for group, tallies in results.items():
+    for group, accumulators in results.items():
         figure, (start, trust) = plt.subplots(1, 2, figsize=(11, 4), width_ratios=(3, 2))
-        for name, tally in tallies.items():
-            epes = tally.epe_by_frame()
+        for name, accumulator in accumulators.items():
+            epes = accumulator.epe_by_frame()
             start.plot(range(1, len(epes) + 1), epes, label=name, marker="." * (len(epes) < 2))
-            summary = tally.summary()
+            summary = accumulator.summary()
             told = [summary[f"within_{s}"] for s in SHARES_PCT if f"within_{s}" in summary]
             if told:
                 trust.plot(SHARES_PCT, told, marker=".", label=name)

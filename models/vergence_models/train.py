@@ -54,14 +54,14 @@ def train(trainer: Trainer, arguments: argparse.Namespace) -> None:
     def elapsed_minutes() -> float:
         return (time.monotonic() - started) / 60
 
-    eaten = batches(
+    training_batches = batches(
         arguments.pool,
         trainer.config.training,
         first_step=trainer.progress.steps,
         workers=arguments.workers,
     )
     while not stop and elapsed_minutes() < arguments.minutes:
-        recent.append(trainer.step(next(eaten)))
+        recent.append(trainer.step(next(training_batches)))
         now = time.monotonic()
         trainer.progress.minutes += (now - last) / 60
         last = now
@@ -78,7 +78,7 @@ def train(trainer: Trainer, arguments: argparse.Namespace) -> None:
             write_line(out, {"step": trainer.progress.steps, "validation": trainer.measured})
             trainer.save(out)
             validated = saved = last = time.monotonic()
-    eaten.close()
+    training_batches.close()
     trainer.save(out)  # before what takes long: whoever stops a run may not wait for it
     if held_out is not None and trainer.progress.steps:
         trainer.measured = validate(trainer.averaged_network(), held_out, trainer.device)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from vergence_models.data.xrbench import rooms, truths
 from vergence_models.data.xrbench.camera import Eye, StereoCamera
-from vergence_models.data.xrbench.motion import HeadPath
+from vergence_models.data.xrbench.head_path import HeadPath
 from vergence_models.data.xrbench.recipe import KINDS, SETS, BadRecipe, Effects, Recipe
 from vergence_models.data.xrbench.sheet import contact_sheet
 from vergence_models.data.xrbench.things import Room

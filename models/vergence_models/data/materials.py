@@ -31,7 +31,7 @@ class Material:
 MATERIAL_COLUMNS = 14
 
 
-class Palette:
+class MaterialPalette:
     """Draws random materials from a bank's textures."""
 
     def __init__(self, rng: np.random.Generator, kinds: tuple[str, ...]) -> None:

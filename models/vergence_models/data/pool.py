@@ -129,7 +129,7 @@ def _to_and_fro(steps: NDArray[np.int_], frames: int) -> NDArray[np.int_]:
 
 
 def _read(shard: _Shard, row: int) -> StereoClips:
-    images = torch.from_numpy(np.array(shard.images[row])).permute(1, 0, 4, 2, 3)
+    images = torch.from_numpy(np.array(shard.images[row])).transpose(0, 1)
     disparity = shard.disparity[row].astype(np.float32) / DISPARITY_SCALE
     width = disparity.shape[-1]
     visible = np.unpackbits(shard.visible[row], axis=-1, count=width).astype(bool)
@@ -164,7 +164,7 @@ def _crop(clip: StereoClips, rng: np.random.Generator, width: int, height: int) 
     disparity = clip.disparity_px[..., rows, columns]
     matched = torch.arange(width) - disparity >= 0
     return StereoClips(
-        clip.left[..., rows, columns], clip.right[..., rows, columns], disparity,
+        clip.left[:, :, rows, columns], clip.right[:, :, rows, columns], disparity,
         clip.visible[..., rows, columns] & matched, clip.world_from_left,
         clip.fx, clip.fy, clip.cx - x, clip.cy - y, clip.baseline_m,
     )  # fmt: skip
@@ -175,7 +175,7 @@ def _upside_down(clip: StereoClips) -> StereoClips:
     mirror = torch.diag(torch.tensor([1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
     height = clip.disparity_px.shape[-2]
     return StereoClips(
-        clip.left.flip(-2), clip.right.flip(-2), clip.disparity_px.flip(-2), clip.visible.flip(-2),
+        clip.left.flip(2), clip.right.flip(2), clip.disparity_px.flip(2), clip.visible.flip(2),
         mirror @ clip.world_from_left @ mirror,
         clip.fx, clip.fy, clip.cx, height - 1 - clip.cy, clip.baseline_m,
     )  # fmt: skip
@@ -186,7 +186,7 @@ def write_shard(folder: Path, clips: StereoClips) -> None:
     partial = folder.with_suffix(".partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
-    images = torch.stack([clips.left, clips.right], dim=2).permute(0, 1, 2, 4, 5, 3)
+    images = torch.stack([clips.left, clips.right], dim=2)
     disparity = (clips.disparity_px.double() * DISPARITY_SCALE).round().clamp(0, 65535)
     camera = torch.stack([clips.fx, clips.fy, clips.cx, clips.cy, clips.baseline_m], dim=1)
     shard = _Shard(

@@ -46,14 +46,14 @@ class Cameras(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Hits:
+class RayHits:
     """What the pixel centres of V views see."""
 
     depth_m: Tensor  # float32 [V, H, W] along the optical axis; infinite where nothing is hit
     primitive: Tensor  # int64 [V, H, W], index m into `Primitives`; -1 where nothing is hit
 
 
-def cast(primitives: Primitives, cameras: Cameras) -> Hits:
+def cast(primitives: Primitives, cameras: Cameras) -> RayHits:
     """The nearest hit at every pixel centre of every view."""
     rows, columns = -(-cameras.height // TILE_PX), -(-cameras.width // TILE_PX)
     device = primitives.shape.device
@@ -92,7 +92,7 @@ def cast(primitives: Primitives, cameras: Cameras) -> Hits:
                 )
 
     size = (primitives.views, cameras.height, cameras.width)
-    return Hits(_untile(depth, rows, columns, size), _untile(owner, rows, columns, size).long())
+    return RayHits(_untile(depth, rows, columns, size), _untile(owner, rows, columns, size).long())
 
 
 def intersect_rays(

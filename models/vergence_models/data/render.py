@@ -11,7 +11,7 @@ from torch import Tensor
 
 from vergence_models.data import scenes
 from vergence_models.data.clips import StereoClips
-from vergence_models.data.raycast import Cameras, Hits, Primitives, cast, intersect_rays
+from vergence_models.data.raycast import Cameras, Primitives, RayHits, cast, intersect_rays
 from vergence_models.data.shading import FACES, Illumination, shade
 from vergence_models.data.shapes import Shape
 from vergence_models.data.textures import TextureBank
@@ -48,7 +48,6 @@ def render(
     color = _color(primitives, table, cameras, hits, light, bank)
     color = color.view(count, frames * 2, height, width, 3)
     image = _develop(color, shots).view(count, frames, 2, height, width, 3)
-    image = image.permute(0, 1, 2, 5, 3, 4).contiguous()
 
     disparity = (focal * per_view([s.baseline_m for s in shots]))[:, None, None] / hits.depth_m
     disparity = disparity.view(count, frames, 2, height, width)
@@ -139,7 +138,7 @@ def _shadow_maps(rows: Tensor, shots: list[Shot]) -> tuple[Tensor, Tensor, list[
 
 
 def _color(
-    primitives: Primitives, table: Tensor, cameras: Cameras, hits: Hits, light: Illumination,
+    primitives: Primitives, table: Tensor, cameras: Cameras, hits: RayHits, light: Illumination,
     bank: TextureBank,
 ) -> Tensor:  # fmt: skip
     """Linear RGB [V, H, W, 3]: one sample a pixel, and four where a surface ends."""

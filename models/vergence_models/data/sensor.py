@@ -63,7 +63,7 @@ class _Recording:
         def happens(chance: float) -> bool:
             return bool(rng.random() < chance)
 
-        frames, _, height, width = shape
+        frames, height, width, _ = shape
         self._rng = rng
         self._noise = noise
         shifts = happens(config.misalignment)
@@ -84,10 +84,10 @@ class _Recording:
         self._jpeg = int(rng.integers(35, 96)) if happens(config.jpeg) else None
 
     def eye(self, frames: Tensor, *, right: bool) -> Tensor:
-        """Record frames uint8 [T, 3, H, W] of one eye."""
-        images = np.ascontiguousarray(frames.permute(0, 2, 3, 1).cpu().numpy())
+        """Record frames uint8 [T, H, W, 3] of one eye."""
+        images = np.ascontiguousarray(frames.cpu().numpy())
         recorded = [self._record(image, t, right) for t, image in enumerate(images)]
-        return torch.from_numpy(np.stack(recorded)).permute(0, 3, 1, 2).to(frames.device)
+        return torch.from_numpy(np.stack(recorded)).to(frames.device)
 
     def _record(self, image: Image, frame: int, right: bool) -> Image:
         if right and self._shift_px:

@@ -25,7 +25,7 @@ class Method:
     label: str
     predict: Callable[[Footage], Iterator[Prediction]]
 
-    def told(self, what: str, change: Callable[[Footage], Footage]) -> Method:
+    def with_input(self, what: str, change: Callable[[Footage], Footage]) -> Method:
         """The same method, shown changed footage."""
         return Method(f"{self.label}, {what}", lambda footage: self.predict(change(footage)))
 
@@ -35,8 +35,8 @@ def counted(iterations: int) -> str:
 
 
 def counted_start(network: SteppedNetwork, iterations: int) -> str:
-    closer = ", the last ones a closer look" if network.looks_closer(iterations) else ""
-    return counted(iterations) + closer
+    refined = ", the last ones at 2x" if network.refines_at_2x(iterations) else ""
+    return counted(iterations) + refined
 
 
 def warm_method(network: SteppedNetwork, name: str, iterations: int, *, cold: int) -> Method:

@@ -35,7 +35,7 @@ class Estimate(ABC):
         """The loss of this step against ``truth_px`` [B, H, W] (0 = unknown), a scalar."""
 
 
-class Found(NamedTuple):
+class StepOutput(NamedTuple):
     """What a step gives to whoever has no use for more: the outputs of an exported graph."""
 
     disparity: Tensor  # float32 [B, H, W], px
@@ -66,21 +66,25 @@ class StereoNetwork(nn.Module, ABC, Generic[ConfigT]):
     ) -> tuple[Estimate, State]:
         """One step. ``left`` and ``right`` uint8 [B, H, W, 3]; H and W multiples of the stride."""
 
-    def cold_step(self, left: Tensor, right: Tensor, iterations: int, *, closer: int = 0) -> Found:
-        """A step that knows of no frame before, the last ``closer`` iterations at twice the size.
+    def cold_step(
+        self, left: Tensor, right: Tensor, iterations: int, *, at_2x: int = 0
+    ) -> StepOutput:
+        """A step that knows of no frame before, the last ``at_2x`` iterations at twice the size.
 
         Raises ValueError if the tier takes no closer look and is asked for one.
         """
         batch, height, width, _ = left.shape
         still = torch.eye(4, device=left.device).repeat(batch, 1, 1)
         nothing = self.cold_state(batch, height, width)
-        estimate, state = self(left, right, still, nothing, iterations - closer)
-        found = Found(estimate.disparity, estimate.sigma, state)
-        return self.closer_look(left, right, found, closer) if closer else found
+        estimate, state = self(left, right, still, nothing, iterations - at_2x)
+        found = StepOutput(estimate.disparity, estimate.sigma, state)
+        return self.refine_at_2x(left, right, found, at_2x) if at_2x else found
 
-    def closer_look(self, left: Tensor, right: Tensor, found: Found, iterations: int) -> Found:
+    def refine_at_2x(
+        self, left: Tensor, right: Tensor, found: StepOutput, iterations: int
+    ) -> StepOutput:
         """What more iterations at twice the size make of what was ``found`` in a step's images."""
-        raise ValueError(f"{type(self).__name__} takes no closer look, got {iterations} iterations")
+        raise ValueError(f"{type(self).__name__} cannot refine at 2x, got {iterations} iterations")
 
     def cold_state(self, batch: int, height: int, width: int) -> State:
         """The state that knows nothing, for images of that size, where the weights are."""

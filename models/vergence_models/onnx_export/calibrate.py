@@ -13,14 +13,14 @@ import onnxruntime
 from numpy.typing import NDArray
 from onnx import ModelProto, TensorProto, helper
 
-from vergence_models.config import Kind
+from vergence_models.config import StepKind
 from vergence_models.data.clips import StereoClips
 from vergence_models.data.pool import ClipPool
 from vergence_models.onnx_export.pair_sums import overflowing
-from vergence_models.onnx_export.quantization_plan import plan
-from vergence_models.onnx_export.quantize import Scale, copy_of, quantized, with_weights_apart
+from vergence_models.onnx_export.quantization_plan import plan_quantization
+from vergence_models.onnx_export.quantize import ByteScale, copy_of, quantized, with_weights_apart
 from vergence_models.onnx_export.rounding import inputs_of
-from vergence_models.training.motion import uvd_transforms
+from vergence_models.training.camera_motion import uvd_transforms
 from vergence_models.training.validation import filmed
 from vergence_proto.model_io import DISPARITY, LEFT, RIGHT, UVD_CURR_FROM_PREV, StateTensor
 
@@ -40,24 +40,24 @@ class QuantizationError(RuntimeError):
 
 
 def make_int8(
-    models: Mapping[Kind, ModelProto],
+    models: Mapping[StepKind, ModelProto],
     states: Sequence[StateTensor],
     pool: ClipPool,
     *,
     max_disparity_px: float,
-) -> tuple[dict[Kind, ModelProto], dict[str, object]]:
+) -> tuple[dict[StepKind, ModelProto], dict[str, object]]:
     """Int8 graphs of float ones, and the story for the manifest.
 
     Raises QuantizationError if the smallest loses more than :data:`MAX_LOSS`, or if a product in
     any of them may overflow 16 bits.
     """
     clips = filmed(pool, range(RANGE_CLIPS))
-    made: dict[Kind, ModelProto] = {}
+    made: dict[StepKind, ModelProto] = {}
     story: dict[str, object] = {}
     for kind, whole in sorted(models.items()):
         model = with_weights_apart(whole)
-        what = plan(model)
-        cold = kind.closer > 0
+        what = plan_quantization(model)
+        cold = kind.at_2x > 0
         seen = steps(model, states, clips, what.measured, forget=cold)
         scales = scales_of(seen, what.measured)
         convolutions = [each for each in model.graph.node if each.output[0] in what.convolutions]
@@ -109,13 +109,10 @@ def steps(
     )
     wanted = [*names, *(tensor.output_name for tensor in states)]
     matrices = uvd_transforms(clips, clips.world_from_left).numpy()
-    batch, frames, _, height, width = clips.left.shape
+    batch, frames, height, width, _ = clips.left.shape
     state = {t.input_name: np.zeros((batch, *t.shape(height, width)), np.float32) for t in states}
     for frame in range(frames):
-        left, right = (
-            eye[:, frame].permute(0, 2, 3, 1).contiguous().numpy()
-            for eye in (clips.left, clips.right)
-        )
+        left, right = (image.numpy() for image in clips.pair(frame))
         images = {LEFT: left, RIGHT: right, UVD_CURR_FROM_PREV: matrices[:, frame]}
         found = session.run(wanted, {**images, **state})
         yield dict(zip(names, found, strict=False))
@@ -127,14 +124,14 @@ def steps(
         }
 
 
-def scales_of(seen: Iterable[Mapping[str, Array]], names: Sequence[str]) -> dict[str, Scale]:
+def scales_of(seen: Iterable[Mapping[str, Array]], names: Sequence[str]) -> dict[str, ByteScale]:
     """For each tensor the scale that covers all that it holds."""
     low, high = dict.fromkeys(names, 0.0), dict.fromkeys(names, 0.0)
     for found in seen:
         for name, values in found.items():
             low[name] = min(low[name], float(values.min()))
             high[name] = max(high[name], float(values.max()))
-    return {name: Scale.of_range(low[name], high[name]) for name in names}
+    return {name: ByteScale.of_range(low[name], high[name]) for name in names}
 
 
 def epe_px(

@@ -23,7 +23,7 @@ MIN_CHANNELS = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Plan:
+class QuantizationPlan:
     """Which convolutions of a graph become int8, and which tensors bytes."""
 
     convolutions: frozenset[str]  # by the tensor that they give
@@ -38,7 +38,7 @@ class Plan:
         return sorted(set(self.source.values()) - set(self.images))
 
 
-def plan(model: ModelProto) -> Plan:
+def plan_quantization(model: ModelProto) -> QuantizationPlan:
     """What to quantise: convolutions of features, what goes in and out of them, and its sums."""
     constants = {tensor.name: tensor for tensor in model.graph.initializer}
     readers: dict[str, list[NodeProto]] = {}
@@ -100,7 +100,7 @@ def plan(model: ModelProto) -> Plan:
             continue
         if node.op_type in COPYING_OPS or (whole in made_by and made_by[whole].op_type == "Concat"):
             source.setdefault(whole, source[result])
-    return Plan(frozenset(convolutions), frozenset(products), images, source, absorbed)
+    return QuantizationPlan(frozenset(convolutions), frozenset(products), images, source, absorbed)
 
 
 def casts_to_bytes(node: NodeProto) -> bool:

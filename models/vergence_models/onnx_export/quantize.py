@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from onnx import ModelProto, NodeProto, TensorProto, helper, numpy_helper
 
 from vergence_models.onnx_export.pair_sums import finest_steps, in_safe_parts
-from vergence_models.onnx_export.quantization_plan import COPYING_OPS, Plan
-from vergence_models.onnx_export.rounding import Inputs, rounded
+from vergence_models.onnx_export.quantization_plan import COPYING_OPS, QuantizationPlan
+from vergence_models.onnx_export.rounding import PatchStatistics, rounded
 
 Array = NDArray[np.generic]
 
@@ -26,14 +26,14 @@ BYTES = ".bytes"  # behind a tensor's name: the same as bytes
 
 
 @dataclass(frozen=True, slots=True)
-class Scale:
+class ByteScale:
     """A real number is ``step * (byte - zero)``."""
 
     step: np.float32
     zero: np.uint8
 
     @classmethod
-    def of_range(cls, low: float, high: float) -> Scale:
+    def of_range(cls, low: float, high: float) -> ByteScale:
         """The finest that reaches from ``low`` to ``high`` and has an exact 0."""
         low, high = min(low, 0.0), max(high, 1e-6)
         step = (high - low) / 255
@@ -63,9 +63,9 @@ def with_weights_apart(model: ModelProto) -> ModelProto:
 
 def quantized(
     model: ModelProto,
-    what: Plan,
-    scales: dict[str, Scale],
-    inputs: Mapping[str, Inputs] | None = None,
+    what: QuantizationPlan,
+    scales: dict[str, ByteScale],
+    inputs: Mapping[str, PatchStatistics] | None = None,
 ) -> ModelProto:
     """The same graph with Quantize and Dequantize nodes where the plan wants bytes.
 
@@ -89,14 +89,14 @@ class _Writer:
     def __init__(
         self,
         model: ModelProto,
-        what: Plan,
-        scales: dict[str, Scale],
-        inputs: Mapping[str, Inputs],
+        what: QuantizationPlan,
+        scales: dict[str, ByteScale],
+        inputs: Mapping[str, PatchStatistics],
     ) -> None:
         self._model = model
         self._plan = what
         self._inputs = inputs
-        scales = {**scales, **dict.fromkeys(what.images, Scale(np.float32(1), np.uint8(0)))}
+        scales = {**scales, **dict.fromkeys(what.images, ByteScale(np.float32(1), np.uint8(0)))}
         self._scales = {name: scales[source] for name, source in what.source.items()}
         self._old = {tensor.name: tensor for tensor in model.graph.initializer}
         self._outputs = {output.name for output in model.graph.output}

@@ -27,7 +27,7 @@ DAMPING = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Inputs:
+class PatchStatistics:
     """What a convolution sees in one place: K values, in the order of its weights."""
 
     mean: Reals  # [K]
@@ -36,7 +36,7 @@ class Inputs:
 
 def inputs_of(
     seen: Iterable[Mapping[str, Array]], convolutions: Sequence[NodeProto], model: ModelProto
-) -> dict[str, Inputs]:
+) -> dict[str, PatchStatistics]:
     """Statistics of the patches that convolutions see, by the tensors that they give.
 
     The patches are drawn by the name of that tensor, the same in every graph that has it.
@@ -58,7 +58,7 @@ def inputs_of(
             squares[result] = squares.get(result, 0) + drawn.T @ drawn / len(drawn)
     means = {result: total / frames for result, total in sums.items()}
     return {
-        result: Inputs(mean, squares[result] / frames - np.outer(mean, mean))
+        result: PatchStatistics(mean, squares[result] / frames - np.outer(mean, mean))
         for result, mean in means.items()
     }
 

@@ -7,9 +7,9 @@ from itertools import chain
 
 from onnx import ModelProto, TensorProto, ValueInfoProto
 
-from vergence_models.config import Kind
+from vergence_models.config import StepKind
 from vergence_models.onnx_export.quantize import BYTES
-from vergence_models.onnx_export.stitch import Parts
+from vergence_models.onnx_export.stitch import StepParts
 
 
 class StageError(RuntimeError):
@@ -17,8 +17,8 @@ class StageError(RuntimeError):
 
 
 def in_stages(
-    name: str, models: Mapping[Kind, ModelProto], handed: Sequence[Sequence[ValueInfoProto]]
-) -> tuple[dict[Kind, list[list[str]]], dict[str, ModelProto]]:
+    name: str, models: Mapping[StepKind, ModelProto], handed: Sequence[Sequence[ValueInfoProto]]
+) -> tuple[dict[StepKind, list[list[str]]], dict[str, ModelProto]]:
     """Cut whole steps into graphs that run side by side, the same for all kinds, and the rest.
 
     ``handed`` says what each of the former gives. Returns the stages of each kind, by file, and
@@ -29,7 +29,7 @@ def in_stages(
     processor time, and no less of the user's.
     """
     files: dict[str, ModelProto] = {}
-    stages: dict[Kind, list[list[str]]] = {}
+    stages: dict[StepKind, list[list[str]]] = {}
     for kind, model in models.items():
         made = {result for node in model.graph.node for result in node.output}
         passed = [[as_made(entry, made) for entry in group] for group in handed]
@@ -44,7 +44,7 @@ def in_stages(
     return stages, files
 
 
-def handed_on(parts: Parts[ModelProto]) -> list[list[ValueInfoProto]]:
+def handed_on(parts: StepParts[ModelProto]) -> list[list[ValueInfoProto]]:
     """What each graph of ``begin`` gives, as :func:`stitched` names it."""
     return [
         [renamed(entry, f"begin_{number}.{entry.name}") for entry in part.graph.output]

@@ -13,7 +13,7 @@ from typing import Generic, NamedTuple, TypeVar
 import onnx
 from onnx import ModelProto, NodeProto, TensorProto
 
-from vergence_models.config import Kind
+from vergence_models.config import StepKind
 
 T = TypeVar("T")
 SMALL_BYTES = 1024  # such tensors stay in the graph: shapes and scalars that runtimes fold
@@ -22,7 +22,7 @@ TAKES_PLACE = "to_"
 PLAIN = "plain_"  # before what was found by a look that was not the last
 
 
-class CloserLook(NamedTuple, Generic[T]):
+class RefinementAt2x(NamedTuple, Generic[T]):
     """What it takes to go on at another size, and to come back.
 
     ``enter`` takes the images and what ``end`` gave, and gives what ``begin`` takes, a state too.
@@ -35,7 +35,7 @@ class CloserLook(NamedTuple, Generic[T]):
     join: T
 
 
-class Parts(NamedTuple, Generic[T]):
+class StepParts(NamedTuple, Generic[T]):
     """What is found before the iterations, by graphs that do not need each other; one; the rest.
 
     Outputs are found by name. One that is called to_NAME takes the place of NAME.
@@ -44,34 +44,34 @@ class Parts(NamedTuple, Generic[T]):
     begin: tuple[T, ...]
     iterate: T
     end: T
-    closer: CloserLook[T] | None = None
+    at_2x: RefinementAt2x[T] | None = None
 
 
-def stitched(parts: Parts[ModelProto], kind: Kind) -> ModelProto:
+def stitched(parts: StepParts[ModelProto], kind: StepKind) -> ModelProto:
     """One graph: inputs of ``begin``, outputs of ``end``, and the iterations between.
 
     What is computed anew for a closer look and not needed stays in; runtimes leave it out.
     """
-    line = _Line(parts.begin[0])
+    line = _GraphBuilder(parts.begin[0])
     line.begin(parts)
-    line.iterate(parts, range(kind.iterations - kind.closer))
-    if kind.closer:
-        assert parts.closer is not None
+    line.iterate(parts, range(kind.iterations - kind.at_2x))
+    if kind.at_2x:
+        assert parts.at_2x is not None
         plain = line.add("end", parts.end, place="plain_end")
         line.known |= {PLAIN + name: result for name, result in plain.items()}
-        larger = line.add("enter", parts.closer.enter)
+        larger = line.add("enter", parts.at_2x.enter)
         line.begin(parts, place="closer_")
-        line.known |= {name: larger[given] for given, name in parts.closer.moved.items()}
-        line.iterate(parts, range(kind.iterations - kind.closer, kind.iterations))
+        line.known |= {name: larger[given] for given, name in parts.at_2x.moved.items()}
+        line.iterate(parts, range(kind.iterations - kind.at_2x, kind.iterations))
         line.add("end", parts.end, place="closer_end")
-        line.add("join", parts.closer.join, last=True)
+        line.add("join", parts.at_2x.join, last=True)
     else:
         line.add("end", parts.end, last=True)
     line.model.graph.output.extend(parts.end.graph.output)
     return line.model
 
 
-class _Line:
+class _GraphBuilder:
     """A graph that grows at its end."""
 
     def __init__(self, first: ModelProto) -> None:
@@ -84,11 +84,11 @@ class _Line:
         self.known = {entry.name: entry.name for entry in self._graph.input}
         self._weights: set[str] = set()
 
-    def begin(self, parts: Parts[ModelProto], *, place: str = "") -> None:
+    def begin(self, parts: StepParts[ModelProto], *, place: str = "") -> None:
         for number, part in enumerate(parts.begin):
             self.add(f"begin_{number}", part, place=f"{place}begin_{number}")
 
-    def iterate(self, parts: Parts[ModelProto], numbers: Iterable[int]) -> None:
+    def iterate(self, parts: StepParts[ModelProto], numbers: Iterable[int]) -> None:
         for number in numbers:
             self.add("iterate", parts.iterate, place=f"iterate_{number}")
 

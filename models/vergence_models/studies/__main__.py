@@ -26,9 +26,9 @@ from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn
 from vergence_models.config import ConfigError
 from vergence_models.evaluate import WEIGHTS
 from vergence_models.studies.bench import Bench
+from vergence_models.studies.experiments import STUDIES, Study, kitti, on_data
 from vergence_models.studies.footage import StudySettings, group_on_disk
-from vergence_models.studies.networks import gather_contenders, missing_tiers
-from vergence_models.studies.plan import STUDIES, Study, kitti, on_data
+from vergence_models.studies.networks import gather_networks, missing_tiers
 from vergence_models.studies.plots import draw_plots
 from vergence_models.studies.tables import (
     StudyFileError,
@@ -111,11 +111,11 @@ def main(arguments: list[str] | None = None) -> None:
     columns = (SpinnerColumn(), *Progress.get_default_columns()[:1], TimeElapsedColumn())
     try:
         tables = read_tables(given.json)
-        contenders = gather_contenders(given.weights, given.run, threads=given.threads)
-        missing = missing_tiers(contenders)
+        networks = gather_networks(given.weights, given.run, threads=given.threads)
+        missing = missing_tiers(networks)
         with Progress(*columns, console=Console(stderr=True)) as progress:
             bench = Bench(
-                contenders,
+                networks,
                 settings=settings,
                 cache=given.cache,
                 workers=given.workers,

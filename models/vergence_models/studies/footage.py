@@ -24,7 +24,7 @@ ROOMS = Mix(streets=0.0, swarms=0.0, clutter=0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Group:
+class FootageGroup:
     """Sequences that are judged together; read anew each time, never all in memory."""
 
     name: str
@@ -54,11 +54,11 @@ class StudySettings:
     timed: int = 5  # frames of each method
 
 
-def clips_at(speed: int, settings: StudySettings, cache: Path, *, workers: int) -> Group:
+def clips_at(speed: int, settings: StudySettings, cache: Path, *, workers: int) -> FootageGroup:
     """Short clips at one speed, judged by their last frame: the same view at every speed."""
     s = settings
     folder = rendered(Playback(speed), s.short, s, cache, workers=workers)
-    return Group(
+    return FootageGroup(
         f"clips, {speed}x",
         f"the last of {s.short} frames of {s.clips} held-out clips of rooms, {s.width}x{s.height}, "
         f"from our generator (seed {SEED}): the same view whatever the speed",
@@ -68,11 +68,11 @@ def clips_at(speed: int, settings: StudySettings, cache: Path, *, workers: int) 
     )
 
 
-def whole_clips(settings: StudySettings, cache: Path, *, workers: int) -> Group:
+def whole_clips(settings: StudySettings, cache: Path, *, workers: int) -> FootageGroup:
     """The clips as a calm head films them."""
     s = settings
     folder = rendered(Playback(), s.frames, s, cache, workers=workers)
-    return Group(
+    return FootageGroup(
         "clips",
         f"{s.clips} held-out clips of rooms, {s.frames} frames, {s.width}x{s.height}, from our "
         f"generator (seed {SEED})",
@@ -101,7 +101,7 @@ def rendered(
     return folder
 
 
-def group_on_disk(spec: str, frames: int) -> Group:
+def group_on_disk(spec: str, frames: int) -> FootageGroup:
     """Every source under KIND:PATH. Raises LayoutError as it is read."""
     words = f"at most {frames} frames of each sequence in `{spec}`"
-    return Group(spec, words, frames, lambda: footage_on_disk(find_sources(spec)))
+    return FootageGroup(spec, words, frames, lambda: footage_on_disk(find_sources(spec)))

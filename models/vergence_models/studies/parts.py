@@ -15,12 +15,12 @@ from pathlib import Path
 import torch
 from rich.progress import track
 
-from vergence_models.config import ConfigError, Kind
+from vergence_models.config import ConfigError, StepKind
 from vergence_models.data.pool import ClipPool
 from vergence_models.networks.layers import ConvexUpsampler
 from vergence_models.networks.lite.network import LiteNetwork
-from vergence_models.studies.networks import Training
-from vergence_models.studies.tables import Row, Table, markdown, write_tables
+from vergence_models.studies.networks import TrainingSummary
+from vergence_models.studies.tables import Table, TableRow, markdown, write_tables
 from vergence_models.training.runs import RunError, read_run, trained_network
 from vergence_models.training.validation import START, validate
 
@@ -31,7 +31,7 @@ COLUMNS = {
 }
 NEVER = -1e3  # a logit
 PATIENT = "all of it, 8 iterations on cold frames"
-CLOSER = "the same, the last 2 of them a closer look"
+REFINED = "the same, the last 2 of them at 2x"
 
 
 def rims_never_chosen(network: LiteNetwork) -> None:
@@ -82,9 +82,9 @@ PARTS: dict[str, Callable[[LiteNetwork], None]] = {
     "1/4: no last correction": silenced("refinement.out"),
     "bilinear enlargement": bilinear,
     PATIENT: lambda network: None,
-    CLOSER: lambda network: None,
+    REFINED: lambda network: None,
 }
-STARTS = {PATIENT: Kind(8), CLOSER: Kind(8, closer=2)}
+STARTS = {PATIENT: StepKind(8), REFINED: StepKind(8, at_2x=2)}
 
 
 def table_of_parts(run_folder: Path, pool: ClipPool, *, clips: int) -> Table:
@@ -99,7 +99,7 @@ def table_of_parts(run_folder: Path, pool: ClipPool, *, clips: int) -> Table:
             silence(network)
         start = STARTS.get(label, START)
         figures = validate(network, pool, torch.device("cpu"), clips=clips, start=start)
-        rows.append(Row(label, {key: figures[key] for key in COLUMNS}))
+        rows.append(TableRow(label, {key: figures[key] for key in COLUMNS}))
     return Table(
         name="parts",
         title="What each part of lite is worth",
@@ -108,7 +108,7 @@ def table_of_parts(run_folder: Path, pool: ClipPool, *, clips: int) -> Table:
         "ones 1.",
         columns=COLUMNS,
         rows=rows,
-        training=[Training.of(run.config_name, "PyTorch", run.story).words],
+        training=[TrainingSummary.of(run.config_name, "PyTorch", run.story).words],
     )
 
 

@@ -20,7 +20,7 @@ class StudyFileError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class TableRow:
     label: str
     values: dict[str, float]  # by the keys of the table's columns; what is unknown is left out
 
@@ -43,10 +43,10 @@ class Table:
     title: str
     text: str  # what was done, on what
     columns: dict[str, str]  # key -> heading
-    rows: list[Row]
+    rows: list[TableRow]
     training: list[str]
     findings: list[str] = field(default_factory=list)
-    paper: list[Row] = field(default_factory=list)  # theirs, on their data
+    paper: list[TableRow] = field(default_factory=list)  # theirs, on their data
     paper_note: str = ""
     curves: list[Curve] = field(default_factory=list)
     x_label: str = ""
@@ -60,8 +60,8 @@ class Table:
 def table_from_dict(values: dict[str, Any]) -> Table:
     """The inverse of ``dataclasses.asdict``; ``values`` is any JSON."""
     lists = {
-        "rows": [Row(**row) for row in values["rows"]],
-        "paper": [Row(**row) for row in values["paper"]],
+        "rows": [TableRow(**row) for row in values["rows"]],
+        "paper": [TableRow(**row) for row in values["paper"]],
         "curves": [Curve(**curve) for curve in values["curves"]],
     }
     return Table(**{**values, **lists})
@@ -93,7 +93,7 @@ def with_times(table: Table, times: Table | None) -> Table:
         return table
     known = {row.label: row.values for row in times.rows}
     rows = [
-        Row(
+        TableRow(
             row.label,
             row.values | {k: v for k, v in known.get(row.label, {}).items() if k in TIME_COLUMNS},
         )
@@ -135,6 +135,6 @@ def _section(table: Table) -> str:
     return "\n".join(lines)
 
 
-def _line(label: str, row: Row, columns: Sequence[str]) -> str:
+def _line(label: str, row: TableRow, columns: Sequence[str]) -> str:
     cells = [f"{row.values[key]:.3g}" if key in row.values else "" for key in columns]
     return f"| {label} | " + " | ".join(cells) + " |"

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-PIECE_BYTES = 15 * 2**20
+SHARD_BYTES = 15 * 2**20
 SMALL = 2**14  # elements
 LIFTED = "lifted"  # a dictionary of this one key stands where a tensor was taken out
 
@@ -53,7 +53,7 @@ def split(value: Any, half: torch.dtype) -> tuple[Any, list[dict[str, Tensor]]]:
         stored = leaf.detach().to("cpu", half)
         if stored.nbytes > room:
             pieces.append({})
-            room = PIECE_BYTES
+            room = SHARD_BYTES
         room -= stored.nbytes
         pieces[-1][name] = stored
         return {LIFTED: name}

@@ -22,12 +22,12 @@ from torch import Tensor
 from vergence_models.config import Config, ConfigError, NetworkConfig, network_from_dict
 from vergence_models.networks.base import AnyNetwork
 from vergence_models.networks.factory import build_network
-from vergence_models.training.checkpoint_shards import HALF, PIECE_BYTES, joined, split, tensors_of
+from vergence_models.training.checkpoint_shards import HALF, SHARD_BYTES, joined, split, tensors_of
 
 CHECKPOINT_NAME = "checkpoint.pt"
 LOG_NAME = "log.jsonl"
 WHOLE_FORMAT = 1  # everything in one file
-PIECES_FORMAT = 2  # an index, and the large tensors beside it
+SHARDED_FORMAT = 2  # an index, and the large tensors beside it
 
 
 class RunError(ValueError):
@@ -35,7 +35,7 @@ class RunError(ValueError):
 
 
 @dataclass(slots=True)
-class Progress:
+class TrainingProgress:
     """How far a run has come, over all its sessions."""
 
     steps: int = 0
@@ -66,10 +66,10 @@ class Run:
 
 def save_checkpoint(folder: Path, contents: dict[str, Any]) -> None:
     """Replace a run's checkpoint. ``contents`` is what torch.save takes, with its ``progress``."""
-    if sum(tensor.nbytes for tensor in tensors_of(contents)) < PIECE_BYTES:
+    if sum(tensor.nbytes for tensor in tensors_of(contents)) < SHARD_BYTES:
         save(folder / CHECKPOINT_NAME, {"format": WHOLE_FORMAT, **contents})
         return
-    index = {"format": PIECES_FORMAT, **contents}
+    index = {"format": SHARDED_FORMAT, **contents}
     names: dict[str, list[str]] = {}
     for part, half in HALF.items():
         index[part], pieces = split(contents[part], half)
@@ -104,9 +104,9 @@ def load_checkpoint(folder: Path, parts: Collection[str] = HALF) -> dict[str, An
     contents = load(path)
     if contents.get("format") == WHOLE_FORMAT:
         return contents
-    if contents.get("format") != PIECES_FORMAT:
+    if contents.get("format") != SHARDED_FORMAT:
         raise RunError(
-            f"{path}: expected checkpoint format {WHOLE_FORMAT} or {PIECES_FORMAT}, "
+            f"{path}: expected checkpoint format {WHOLE_FORMAT} or {SHARDED_FORMAT}, "
             f"got {contents.get('format')}"
         )
     for part in parts:

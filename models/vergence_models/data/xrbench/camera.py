@@ -11,10 +11,17 @@ from numpy.typing import NDArray
 
 from vergence_models.data.xrbench import effects, rooms, truths
 from vergence_models.data.xrbench.denoise import denoised
+from vergence_models.data.xrbench.head_path import HeadPath, right_of
 from vergence_models.data.xrbench.meshes import Matrix
-from vergence_models.data.xrbench.motion import HeadPath, right_of
 from vergence_models.data.xrbench.recipe import Recipe
-from vergence_models.data.xrbench.tracer import Hits, Light, Optics, Planes, Tracer, View
+from vergence_models.data.xrbench.tracer import (
+    CameraView,
+    FirstHits,
+    Optics,
+    Planes,
+    TracedLight,
+    Tracer,
+)
 
 Image = NDArray[np.uint8]  # [H, W, 3], RGB
 
@@ -84,7 +91,7 @@ class StereoCamera:
                 self.optics, self.world_from_eye(then_s, eye), then_s, samples=samples,
                 seed=(2 * frame + eye) * len(instants) + index + 1_000_000,
                 flicker=effects.lamp_gain(recipe.effects, then_s),
-                view=View(instant.first_row, rows, instant.lens_m, recipe.effects.focus_m),
+                view=CameraView(instant.first_row, rows, instant.lens_m, recipe.effects.focus_m),
             )  # fmt: skip
             band = np.s_[instant.first_row : instant.first_row + rows]
             opened = instant.open[:, None, None]
@@ -92,7 +99,7 @@ class StereoCamera:
             total[band] += opened * np.concatenate(planes, -1)
             times[band] += opened
         total /= times
-        light = Light(total[..., :3], total[..., 3:6], total[..., 6:9], total[..., 9:])
+        light = TracedLight(total[..., :3], total[..., 3:6], total[..., 6:9], total[..., 9:])
         return self._developed(light, frame, eye, glare=recipe.effects.glare)
 
     def truth(self, frame: int) -> FrameTruth:
@@ -122,11 +129,11 @@ class StereoCamera:
             boxes=truths.boxes(hits, self.room, now_s),
         )
 
-    def _hits(self, frame: int, eye: Eye) -> Hits:
+    def _hits(self, frame: int, eye: Eye) -> FirstHits:
         time_s = self.path.frame_time_s(frame)
         return self._tracer.hits(self.optics, self.world_from_eye(time_s, eye), time_s)
 
-    def _developed(self, light: Light, frame: int, eye: Eye, *, glare: float = 0.0) -> Image:
+    def _developed(self, light: TracedLight, frame: int, eye: Eye, *, glare: float = 0.0) -> Image:
         radiance: Planes = light.radiance
         if self.recipe.denoise:
             # One more pixel around mirrors and glass: outlines are a mixture.

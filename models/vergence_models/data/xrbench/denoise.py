@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vergence_models.data.xrbench.tracer import Light, Planes
+from vergence_models.data.xrbench.tracer import Planes, TracedLight
 
 _LEVELS = 5  # the last one reaches 16 pixels
 _FLOOR = 0.01  # added to the albedo, so that black can be divided by
@@ -15,7 +15,7 @@ _DEPTH = 0.02  # relative step in depth that separates surfaces, a pixel
 _BRIGHTEST = 30.0  # of the median: single paths beyond it are fireflies
 
 
-def denoised(light: Light, keep: NDArray[np.bool_] | None = None) -> Planes:
+def denoised(light: TracedLight, keep: NDArray[np.bool_] | None = None) -> Planes:
     """Linear RGB [H, W, 3]; pixels in `keep` [H, W] (mirrors, glass) stay as they came.
 
     Divides by the albedo, smooths what is left across like normals and depths, multiplies again

@@ -9,8 +9,8 @@ import numpy as np
 
 from vergence_models.data.trajectories import rotation
 from vergence_models.data.xrbench import furniture, meshes
-from vergence_models.data.xrbench.palette import Palette
-from vergence_models.data.xrbench.plan import Plan, Wall
+from vergence_models.data.xrbench.floor_plan import FloorPlan, Wall
+from vergence_models.data.xrbench.palette import SurfacePalette
 from vergence_models.data.xrbench.things import Finish, Room, Surface, Thing, Workbench, placed
 
 
@@ -18,7 +18,7 @@ def build(kind: str, seed: int) -> Room:
     """A room of a kind in `ROOMS`; the same seed builds the same room."""
     # Each kind draws its own numbers: seed 1 of one is no relative of seed 1 of another.
     rng = np.random.default_rng([seed, list(ROOMS).index(kind)])
-    plan = ROOMS[kind](rng, Palette(rng))
+    plan = ROOMS[kind](rng, SurfacePalette(rng))
     start = np.eye(4)
     look = rng.uniform(-0.15, 0.15) - 0.5 * plan.eye_m[0] / plan.half_z
     start[:3, :3] = rotation(np.array([0, look, 0])) @ rotation(
@@ -31,8 +31,8 @@ def build(kind: str, seed: int) -> Room:
     )  # fmt: skip
 
 
-def living_room(rng: np.random.Generator, p: Palette) -> Plan:
-    plan = Plan(rng, p, half_x=rng.uniform(1.9, 2.4), half_z=rng.uniform(2.2, 2.9), height=2.6)
+def living_room(rng: np.random.Generator, p: SurfacePalette) -> FloorPlan:
+    plan = FloorPlan(rng, p, half_x=rng.uniform(1.9, 2.4), half_z=rng.uniform(2.2, 2.9), height=2.6)
     plan.shell(p.patterned("wood", span_m=1.6), p.plain(tone=0.6), _accent(rng, p))
     plan.against(Wall.FAR, "sofa", furniture.sofa)
     plan.against(Wall.FAR, "floor lamp", furniture.floor_lamp)
@@ -48,8 +48,8 @@ def living_room(rng: np.random.Generator, p: Palette) -> Plan:
     return plan
 
 
-def office(rng: np.random.Generator, p: Palette) -> Plan:
-    plan = Plan(rng, p, half_x=rng.uniform(2.0, 2.6), half_z=rng.uniform(2.2, 2.8), height=2.7)
+def office(rng: np.random.Generator, p: SurfacePalette) -> FloorPlan:
+    plan = FloorPlan(rng, p, half_x=rng.uniform(2.0, 2.6), half_z=rng.uniform(2.2, 2.8), height=2.7)
     carpet = p.patterned("speckle", "weave", span_m=0.7)
     plan.shell(carpet, p.plain(tone=0.7))
     plan.against(Wall.FAR, "desk", furniture.desk)
@@ -65,8 +65,8 @@ def office(rng: np.random.Generator, p: Palette) -> Plan:
     return plan
 
 
-def kitchen(rng: np.random.Generator, p: Palette) -> Plan:
-    plan = Plan(rng, p, half_x=rng.uniform(1.7, 2.1), half_z=rng.uniform(2.0, 2.5), height=2.5)
+def kitchen(rng: np.random.Generator, p: SurfacePalette) -> FloorPlan:
+    plan = FloorPlan(rng, p, half_x=rng.uniform(1.7, 2.1), half_z=rng.uniform(2.0, 2.5), height=2.5)
     tiles = p.patterned("tiles", span_m=1.2)
     plan.shell(p.patterned("tiles", "stones", span_m=1.0), p.plain(tone=0.7), tiles)
     plan.against(Wall.FAR, "counter", _counter)
@@ -84,8 +84,8 @@ def kitchen(rng: np.random.Generator, p: Palette) -> Plan:
     return plan
 
 
-def bedroom(rng: np.random.Generator, p: Palette) -> Plan:
-    plan = Plan(rng, p, half_x=rng.uniform(1.9, 2.3), half_z=rng.uniform(2.2, 2.6), height=2.5)
+def bedroom(rng: np.random.Generator, p: SurfacePalette) -> FloorPlan:
+    plan = FloorPlan(rng, p, half_x=rng.uniform(1.9, 2.3), half_z=rng.uniform(2.2, 2.6), height=2.5)
     plan.shell(p.patterned("wood", "weave", span_m=1.4), p.plain(tone=0.6), _accent(rng, p))
     plan.against(Wall.FAR, "bed", furniture.bed)
     plan.against(Wall.RIGHT, "wardrobe", furniture.wardrobe)
@@ -99,9 +99,9 @@ def bedroom(rng: np.random.Generator, p: Palette) -> Plan:
     return plan
 
 
-def studio(rng: np.random.Generator, p: Palette) -> Plan:
+def studio(rng: np.random.Generator, p: SurfacePalette) -> FloorPlan:
     """Bare walls and few things: the hardest room for a matcher."""
-    plan = Plan(rng, p, half_x=rng.uniform(2.2, 2.8), half_z=rng.uniform(2.4, 3.0), height=3.0)
+    plan = FloorPlan(rng, p, half_x=rng.uniform(2.2, 2.8), half_z=rng.uniform(2.4, 3.0), height=3.0)
     plan.shell(p.plain(tone=0.5, finish=Finish.SATIN), p.plain(tone=0.75))
     plan.anywhere("table", furniture.table)
     plan.anywhere("chair", furniture.chair)
@@ -114,7 +114,7 @@ def studio(rng: np.random.Generator, p: Palette) -> Plan:
     return plan
 
 
-def playroom(rng: np.random.Generator, p: Palette) -> Plan:
+def playroom(rng: np.random.Generator, p: SurfacePalette) -> FloorPlan:
     """Things move: a ball rolls, a box spins in the air, a balloon rises."""
     plan = living_room(rng, p)
     ball, box, balloon = Workbench(), Workbench(), Workbench()
@@ -136,7 +136,7 @@ def playroom(rng: np.random.Generator, p: Palette) -> Plan:
     return plan
 
 
-ROOMS: dict[str, Callable[[np.random.Generator, Palette], Plan]] = {
+ROOMS: dict[str, Callable[[np.random.Generator, SurfacePalette], FloorPlan]] = {
     "living_room": living_room,
     "office": office,
     "kitchen": kitchen,
@@ -146,28 +146,28 @@ ROOMS: dict[str, Callable[[np.random.Generator, Palette], Plan]] = {
 }
 
 
-def _accent(rng: np.random.Generator, p: Palette) -> Surface | None:
+def _accent(rng: np.random.Generator, p: SurfacePalette) -> Surface | None:
     """Wallpaper or bricks on the far wall, or paint like everywhere else."""
     if rng.random() < 0.5:
         return None
     return p.patterned("bricks", "stripes", "clouds", "dots", span_m=float(rng.uniform(0.5, 1.2)))
 
 
-def _rug(plan: Plan, p: Palette) -> None:
+def _rug(plan: FloorPlan, p: SurfacePalette) -> None:
     bench = Workbench()
     bench.box(p.patterned("plaid", "patchwork", "stripes", span_m=1.0), (0, -0.006, 0),
               (0.9, 0.006, 0.65))  # fmt: skip
     plan.add("rug", bench, placed(0, 0, plan.half_z * 0.2, yaw=0.1))
 
 
-def _pictures(plan: Plan, p: Palette, rng: np.random.Generator, count: int) -> None:
+def _pictures(plan: FloorPlan, p: SurfacePalette, rng: np.random.Generator, count: int) -> None:
     for _ in range(count):
         side = (Wall.FAR, Wall.RIGHT)[int(rng.integers(2))]
         half_x, half_y = rng.uniform(0.15, 0.4, 2)
         plan.hang(side, p.picture(), half_x, half_y, rng.uniform(1.4, 1.7))
 
 
-def _counter(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
+def _counter(b: Workbench, p: SurfacePalette, rng: np.random.Generator) -> None:
     """Cupboards under a worktop, with a tap, pots and crockery."""
     half_x, body, metal = rng.uniform(1.0, 1.3), p.plain(finish=Finish.SATIN), p.metal()
     b.box(body, (0, -0.44, 0.02), (half_x, 0.44, 0.27))
@@ -184,7 +184,7 @@ def _counter(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
     furniture.set_out(b, p, rng, half_x * 0.9, 0.1, -0.92, count=5, tall_m=0.3, front_m=-0.12)
 
 
-def _fridge(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
+def _fridge(b: Workbench, p: SurfacePalette, rng: np.random.Generator) -> None:
     paint = p.plain(tone=0.7, finish=Finish.SATIN)
     b.box(paint, (0, -0.9, 0.02), (0.3, 0.9, 0.3))
     for y, half in ((-0.6, 0.58), (-1.5, 0.28)):

@@ -41,7 +41,7 @@ class Optics:
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class CameraView:
     """What a camera sees of: some rows of its image, through one point of its lens.
 
     A lens is the average of pinholes at its points, each turned so that what lies at the focus
@@ -55,7 +55,7 @@ class View:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Hits:
+class FirstHits:
     """What the rays through the centres of pixels meet first, in world axes."""
 
     points_m: NDArray[np.float64]  # [H, W, 3]
@@ -65,7 +65,7 @@ class Hits:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Light:
+class TracedLight:
     """What pixels receive, averaged over their area, and the first surfaces behind it."""
 
     radiance: Planes  # [H, W, 3], linear RGB
@@ -117,12 +117,12 @@ class Tracer:
         self._parameters = self._mi.traverse(self._scene)
         self._sensors: dict[tuple[Optics, int | None, bool], tuple[Any, Any]] = {}
 
-    def hits(self, optics: Optics, world_from_camera: Matrix, time_s: float) -> Hits:
+    def hits(self, optics: Optics, world_from_camera: Matrix, time_s: float) -> FirstHits:
         """Exact: one ray through the centre of each pixel of a pinhole camera."""
         planes = self._render(optics, world_from_camera, time_s, samples=1, seed=0, centred=True)
         planes = planes[..., -8:]  # the film puts a colour before them
         index = np.where(planes[..., 0] > 0, planes[..., 4], 0).astype(int)
-        return Hits(
+        return FirstHits(
             points_m=planes[..., 5:8].astype(np.float64),
             normals=planes[..., 1:4].astype(np.float64),
             label=self._label[index],
@@ -131,8 +131,8 @@ class Tracer:
 
     def light(
         self, optics: Optics, world_from_camera: Matrix, time_s: float, *, samples: int, seed: int,
-        flicker: float = 1.0, view: View | None = None,
-    ) -> Light:  # fmt: skip
+        flicker: float = 1.0, view: CameraView | None = None,
+    ) -> TracedLight:  # fmt: skip
         """Path-traced, of the whole image or the rows of a view. `flicker` scales the lamps."""
         if flicker != self._flicker:
             for index, lamp in enumerate(self._room.lamps):
@@ -143,14 +143,14 @@ class Tracer:
         planes = self._render(
             optics, world_from_camera, time_s, samples=samples, seed=seed, view=view
         )
-        return Light(planes[..., :3], planes[..., 7:10], planes[..., 4:7], planes[..., 3:4])
+        return TracedLight(planes[..., :3], planes[..., 7:10], planes[..., 4:7], planes[..., 3:4])
 
     def _render(
         self, optics: Optics, world_from_camera: Matrix, time_s: float, *, samples: int, seed: int,
-        view: View | None = None, centred: bool = False,
+        view: CameraView | None = None, centred: bool = False,
     ) -> Planes:  # fmt: skip
         self._move_things(time_s)
-        view = view or View(0, optics.height)
+        view = view or CameraView(0, optics.height)
         sensor, parameters = self._sensor(optics, view.rows, centred)
         frame = world_from_camera.copy()
         frame[:3, 3] += frame[:3, :2] @ view.lens_m

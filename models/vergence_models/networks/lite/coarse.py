@@ -31,7 +31,7 @@ CELL_INPUTS = TAPS + 2 * FILLS + 5  # what the cell sees besides the context
 MIN_PX = 0.1  # no answer is nearer to infinity
 
 
-class Clues(NamedTuple):
+class CostFeatures(NamedTuple):
     """What the scores of the wide search are made of, as far as two images alone say it."""
 
     fixed: Tensor  # [B, D, H, W] at 1/8, largest disparity first: scores before anything learned
@@ -62,7 +62,7 @@ class CostFilter(nn.Module):
         self.middle = conv(width, width, kernel=1)
         self.leave = silent(conv(width, 4, kernel=1))
 
-    def clues(self, volume: Tensor) -> Clues:
+    def cost_features(self, volume: Tensor) -> CostFeatures:
         """``volume`` [B, H, W, D] at 1/8."""
         batch, height, width, bins = volume.shape
         narrow = volume.permute(0, 3, 1, 2)
@@ -74,23 +74,23 @@ class CostFilter(nn.Module):
         channels = (narrow, middle, lead.clamp(min=-1), claim.clamp(min=-1))
         stacked = torch.stack(channels, dim=2)
         features = self.enter(stacked.reshape(batch * bins, len(channels), height, width))
-        return Clues(fixed + 10 * self.mutual * claim, features)
+        return CostFeatures(fixed + 10 * self.mutual * claim, features)
 
-    def forward(self, clues: Clues, context: Tensor, prior: Tensor) -> Tensor:
+    def forward(self, cost_features: CostFeatures, context: Tensor, prior: Tensor) -> Tensor:
         """Scores [B, H, W, D]; ``context`` [B, C, H/2, W/2], ``prior`` [B, 1, H, W] px or 0."""
-        batch, bins, height, width = clues.fixed.shape
+        batch, bins, height, width = cost_features.fixed.shape
         # Where nothing is expected, nothing is near.
         expected_px = F.pixel_unshuffle(prior - (prior <= 0).to(prior.dtype) * 1e3, 2)
         bin_px = torch.arange(bins - 1, -1, -1, device=prior.device).to(prior.dtype) * BIN_PX
         apart_px = expected_px.reshape(batch, 1, -1) - bin_px[:, None]
         near = (1 - apart_px.abs() * (0.5 / BIN_PX)).clamp(min=0)
-        x = clues.features + self.expected(near.view(-1, 4, height // 2, width // 2))
+        x = cost_features.features + self.expected(near.view(-1, 4, height // 2, width // 2))
         x = x.view(batch, bins, -1, height // 2, width // 2) + context[:, None]
         x = F.relu6(x).view(batch * bins, -1, height // 2, width // 2)
         low = F.relu6(self.low(F.relu6(self.down(x))))
         x = F.relu6(self.middle(x + enlarge(low)))
         residual = F.pixel_shuffle(self.leave(x), 2).view(batch, bins, height, width)
-        return (clues.fixed + residual).permute(0, 2, 3, 1)
+        return (cost_features.fixed + residual).permute(0, 2, 3, 1)
 
 
 def coarse_position(d: Tensor, last: int) -> Tensor:
@@ -175,7 +175,7 @@ class CoarseUpdate(nn.Module):
         context: Tensor,
     ) -> tuple[Tensor, Tensor, Hypotheses]:
         """Hidden state and disparity [B, 1, H, W] px to the next ones; what was chosen among."""
-        guess_px, guess_log = guess
+        peak_px, peak_log = guess
         top = scores.scores.amax(dim=-1)[:, None]
         around = lookup_row(scores, coarse_position(d, scores.last), REACH)
         at_fills = lookup(scores, coarse_position(fills, scores.last))
@@ -184,8 +184,8 @@ class CoarseUpdate(nn.Module):
             (
                 context,
                 log_p * 0.1,
-                guess_log,
-                squash(torch.cat((guess_px, fills), dim=1) - d, 2.0),
+                peak_log,
+                squash(torch.cat((peak_px, fills), dim=1) - d, 2.0),
                 hole,
                 d * (1 / 64),
                 beyond(d, scale=8),
@@ -196,8 +196,8 @@ class CoarseUpdate(nn.Module):
         learned = self.out(F.relu(self.head(hidden)))
         # Fixed part of the choice: the score itself, and a doubt about guesses that are not unique.
         kept, at_fills = log_p[:, REACH : REACH + 1], log_p[:, TAPS:]
-        fixed = torch.cat((kept + 1, 2 * guess_log, at_fills - 1), dim=1)
-        surfaces = torch.cat((d, guess_px, fills), dim=1)
+        fixed = torch.cat((kept + 1, 2 * peak_log, at_fills - 1), dim=1)
+        surfaces = torch.cat((d, peak_px, fills), dim=1)
         hypotheses = Hypotheses(surfaces, fixed + 4 * learned[:, :HYPOTHESES])
         d = (hypotheses.mean() + 4 * learned[:, HYPOTHESES:]).clamp(min=MIN_PX)
         return hidden, d, hypotheses

@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from vergence_models.networks.base import Found
+from vergence_models.networks.base import StepOutput
 from vergence_models.networks.layers import enlarge
 
 MARGIN_PX = 4.0  # of the largest disparity that a search finds well
@@ -36,19 +36,19 @@ def larger_state(disparity: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
     return 2 * enlarge(disparity), enlarge(hidden)
 
 
-def joined(plain: Found, closer: Found, max_disparity_px: int) -> Found:
+def joined(plain: StepOutput, at_2x: StepOutput, max_disparity_px: int) -> StepOutput:
     """The closer look at the size of the plain one, which stays where it is more to be trusted.
 
     That is of what is too near for a search that ends at half of the disparities, and where the
     closer look is elsewhere and less sure of it: on a blank wall it sees less of what is around.
     """
-    disparity, sigma = 0.5 * halved(closer.disparity), SIGMA_SCALE * halved(closer.sigma)
+    disparity, sigma = 0.5 * halved(at_2x.disparity), SIGMA_SCALE * halved(at_2x.sigma)
     elsewhere = (disparity - plain.disparity).abs() > ELSEWHERE_PX
     kept = elsewhere & (sigma > plain.sigma)
     kept = kept | (plain.disparity > max_disparity_px / 2 - MARGIN_PX)
-    (before, _), (after, hidden) = plain.state, closer.state
+    (before, _), (after, hidden) = plain.state, at_2x.state
     kept_cells = kept[:, None, 2::4, 2::4]
-    return Found(
+    return StepOutput(
         torch.where(kept, plain.disparity, disparity),
         torch.where(kept, plain.sigma, sigma),
         (torch.where(kept_cells, before, 0.5 * halved(after)), halved(hidden)),

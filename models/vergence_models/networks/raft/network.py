@@ -20,7 +20,7 @@ from vergence_models.networks.losses import doubt_loss, known, lookup_cross_entr
 from vergence_models.networks.raft.encoder import Encoder
 from vergence_models.networks.raft.update import (
     CELL_PX,
-    ConvexUpsampler,
+    RaftUpsampler,
     Update,
     correlation,
     pyramid,
@@ -88,7 +88,7 @@ class RaftNetwork(StereoNetwork[RaftNetworkConfig]):
             silent(nn.Conv2d(config.head, 1, 3, padding=1)),
         )
         self.update = Update(config)
-        self.upsample = ConvexUpsampler(config)
+        self.upsample = RaftUpsampler(config)
 
     @property
     def state_tensors(self) -> tuple[StateTensor, ...]:

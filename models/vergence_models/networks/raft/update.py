@@ -127,7 +127,7 @@ class Update(nn.Module):
         return (hidden8, hidden16), d + self.head(hidden8) * CELL_PX
 
 
-class ConvexUpsampler(nn.Module):
+class RaftUpsampler(nn.Module):
     """Disparity at full size, each pixel a convex combination of the nine cells round it; sigma."""
 
     def __init__(self, config: RaftNetworkConfig) -> None:

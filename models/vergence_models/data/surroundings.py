@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vergence_models.data.materials import Palette
-from vergence_models.data.scenes import Builder, Light, Scene, look_along
+from vergence_models.data.materials import MaterialPalette
+from vergence_models.data.scenes import Builder, PointLight, Scene, look_along
 from vergence_models.data.shapes import Cutout, Shape
 
 
@@ -31,7 +31,7 @@ class Viewpoint:
 
 
 def float_about(
-    b: Builder, palette: Palette, rng: np.random.Generator, view: Viewpoint, count: int, *,
+    b: Builder, palette: MaterialPalette, rng: np.random.Generator, view: Viewpoint, count: int, *,
     far_m: float, up_m: float, moving: float, large: bool = False,
 ) -> None:  # fmt: skip
     """Things afloat in view, some of them travelling and spinning."""
@@ -71,8 +71,9 @@ def light_color(rng: np.random.Generator, strength: float) -> NDArray[np.float64
 
 
 def compose(
-    b: Builder, rng: np.random.Generator, palette: Palette, lights: tuple[Light, Light],
-    target: NDArray[np.float64], half_angle: float, *, sky: bool = False,
+    b: Builder, rng: np.random.Generator, palette: MaterialPalette,
+    lights: tuple[PointLight, PointLight], target: NDArray[np.float64], half_angle: float, *,
+    sky: bool = False,
 ) -> Scene:  # fmt: skip
     return Scene(
         primitives=np.array(b.rows, np.float32),

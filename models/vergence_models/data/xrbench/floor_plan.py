@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vergence_models.data.xrbench import meshes
-from vergence_models.data.xrbench.furniture import Maker
-from vergence_models.data.xrbench.palette import Palette
+from vergence_models.data.xrbench.furniture_meshes import Maker
+from vergence_models.data.xrbench.palette import SurfacePalette
 from vergence_models.data.xrbench.things import Panel, Surface, Thing, Workbench, placed
 
 # A head sways less than this from where it starts, and still has arm's length to the next thing.
@@ -27,11 +27,11 @@ class Wall(Enum):
     NEAR = np.pi
 
 
-class Plan:
+class FloorPlan:
     """A room around the origin, x in +-half_x and z in +-half_z, and what was put into it."""
 
     def __init__(
-        self, rng: np.random.Generator, palette: Palette, *, half_x: float, half_z: float,
+        self, rng: np.random.Generator, palette: SurfacePalette, *, half_x: float, half_z: float,
         height: float,
     ) -> None:  # fmt: skip
         self.half_x, self.half_z, self.height = half_x, half_z, height
