@@ -25,6 +25,7 @@ from vergence_models.evaluation.methods import (
 )
 from vergence_models.evaluation.metric_accumulator import MetricAccumulator, settled_frame
 from vergence_models.evaluation.metrics import SHARES_PCT
+from vergence_models.evaluation.number_format import cell, decimals
 from vergence_models.evaluation.stepping import (
     Footage,
     OnnxNetwork,
@@ -121,9 +122,12 @@ def markdown(results: Results) -> str:
     for group, accumulators in results.items():
         lines = [f"### {group}", "", "| method | " + " | ".join(COLUMNS.values()) + " |"]
         lines.append("|---|" + "---:|" * len(COLUMNS))
-        for name, accumulator in accumulators.items():
-            found = figures(accumulator)
-            cells = [f"{found[key]:.3g}" if key in found else "" for key in COLUMNS]
+        rows = {name: figures(accumulator) for name, accumulator in accumulators.items()}
+        places = {
+            key: decimals(found[key] for found in rows.values() if key in found) for key in COLUMNS
+        }
+        for name, found in rows.items():
+            cells = [cell(found.get(key), count) for key, count in places.items()]
             lines.append(f"| {name} | " + " | ".join(cells) + " |")
         parts.append("\n".join(lines))
     return "\n\n".join(parts) + "\n"

@@ -73,10 +73,10 @@ def shifted_pair(
 def check_parity(
     network: AnyNetwork, graphs: SteppedNetwork, kind: StepKind, *, frames: int = 3
 ) -> float:
-    """How far 99 % of pixels are from PyTorch's over a short sequence, in px.
+    """The largest difference from PyTorch among 99 % of pixels, over a short sequence, in px.
 
-    A cold kind steps the first frame; the plain one of its count goes on from the state it left.
-    Raises ParityError if that is more than :data:`PARITY_PX`.
+    A cold kind steps the first frame; the plain kind of the same count steps the others.
+    Raises ParityError if the difference is more than :data:`PARITY_PX`.
     """
     height, width = 6 * network.config.stride, 8 * network.config.stride
     state, carried = network.cold_state(1, height, width), graphs.cold_state(height, width)

@@ -23,7 +23,7 @@ from vergence_models.evaluation.methods import (
 )
 from vergence_models.evaluation.stepping import Footage, SteppedNetwork, footage_from_clip
 from vergence_models.onnx_export.calibrate import PARITY_PX
-from vergence_models.studies.__main__ import main
+from vergence_models.studies.__main__ import main, missing_tiers
 from vergence_models.studies.bench import Bench
 from vergence_models.studies.experiments import (
     STUDIES,
@@ -39,9 +39,8 @@ from vergence_models.studies.learning import learning_curves
 from vergence_models.studies.networks import (
     StudiedNetwork,
     gather_networks,
-    missing_tiers,
 )
-from vergence_models.studies.tables import Table, markdown, read_tables, write_tables
+from vergence_models.studies.tables import Table, TableRow, markdown, read_tables, write_tables
 from vergence_models.training.runs import RunError, read_history, read_run
 
 RUN = Path(__file__).parents[2] / "models" / "runs" / "lite"
@@ -195,10 +194,28 @@ def test_a_run_adds_only_the_counts_that_no_graph_has(
         assert np.quantile(difference, 0.99) < PARITY_PX
 
 
-def test_a_tier_without_weights_is_named(networks: list[StudiedNetwork]) -> None:
-    only = [studied for studied in networks if studied.tier == "lite"]
-    assert missing_tiers(only) == ["full", "fast"]
-    assert "`full`, `fast`" in markdown([], missing_tiers(only), [])
+def test_a_tier_without_weights_is_named(tables: dict[str, Table]) -> None:
+    only_lite = list(tables.values())
+    assert missing_tiers(only_lite) == ["full", "fast"]
+    assert "`full`, `fast`" in markdown([], missing_tiers(only_lite), [])
+
+
+def test_a_column_has_the_same_decimals_in_every_row() -> None:
+    rows = [TableRow("slow", {"ms": 1820.0, "epe": 0.5}), TableRow("quick", {"ms": 7.91})]
+    table = Table("t", "T", "", {"ms": "ms", "epe": "EPE"}, rows, training=[])
+    text = markdown([table], [], [])
+    assert "| slow | 1820.0 | 0.50 |" in text
+    assert "| quick | 7.9 |  |" in text
+
+
+def test_markdown_is_written_again_without_running_a_study(
+    tables: dict[str, Table], tmp_path: Path
+) -> None:
+    path = tmp_path / "studies.json"
+    write_tables(path, [tables["speed"]])
+    main(["--json", str(path), "--render"])
+    assert tables["speed"].title in path.with_suffix(".md").read_text()
+    assert read_tables(path) == {"speed": tables["speed"]}
 
 
 def test_tables_survive_their_file(tables: dict[str, Table], tmp_path: Path) -> None:

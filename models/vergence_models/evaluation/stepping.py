@@ -1,4 +1,4 @@
-"""Networks stepped over footage: what evaluation, studies, benchmarks and parity checks share."""
+"""Networks stepped over footage, for evaluation, studies, benchmarks and parity checks."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class FootageView:
     left: Image  # [H, W, 3], RGB
     right: Image
     world_from_left: Pose | None
-    truth_px: Plane | None = None  # [H, W], NaN unknown, mirrors left out
+    truth_px: Plane | None = None  # [H, W]; NaN where unknown and on mirrors
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,7 +85,7 @@ def footage_from_clip(clips: StereoClips, index: int, name: str) -> Footage:
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
     disparity_px: Plane  # [H, W]
-    sigma_px: Plane | None = None  # [H, W]; None: the method does not tell
+    sigma_px: Plane | None = None  # [H, W]; None: the method estimates no sigma
 
 
 NO_MOTION = np.eye(4, dtype=np.float32)
@@ -110,7 +110,7 @@ class StepResult(NamedTuple):
 
 
 class SteppedNetwork(ABC):
-    """A network on a card, whatever computes it."""
+    """A network that can be stepped, whichever runtime computes it."""
 
     card: ModelCard
 
@@ -120,14 +120,14 @@ class SteppedNetwork(ABC):
 
     @abstractmethod
     def start(self, left: Image, right: Image, iterations: int) -> StepResult:
-        """As :meth:`run`, of frames that nothing is known before."""
+        """One step of a batch of first frames, which have no state."""
 
     @abstractmethod
     def refines_at_2x(self, iterations: int) -> bool:
-        """Whether :meth:`start` with so many takes the last of them at twice the size."""
+        """Return True if :meth:`start` runs the last of so many iterations at twice the size."""
 
     def cold_state(self, height: int, width: int, batch: int = 1) -> State:
-        """All zeros, for images of a size that ``card.step_size`` gives."""
+        """All zeros, for images whose size ``card.step_size`` returned."""
         return tuple(
             np.zeros((batch, *tensor.shape(height, width)), np.float32)
             for tensor in self.card.state

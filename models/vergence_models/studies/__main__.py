@@ -1,7 +1,8 @@
 r"""``python -m vergence_models.studies --json FILE``: the paper's studies, on our networks.
 
     python -m vergence_models.studies --json out/studies.json
-    python -m vergence_models.studies --json out/studies.json --studies times     # that table anew
+    python -m vergence_models.studies --json out/studies.json --studies times   # that one again
+    python -m vergence_models.studies --json out/studies.json --render
     python -m vergence_models.studies --json out/studies.json --studies --data vergence:DIR
     python -m vergence_models.studies --json FILE --weights DIR DIR --run runs/lite \
         --data sceneflow:BENCH --kitti vergence:DIR
@@ -28,7 +29,7 @@ from vergence_models.evaluate import WEIGHTS
 from vergence_models.studies.bench import Bench
 from vergence_models.studies.experiments import STUDIES, Study, kitti, on_data
 from vergence_models.studies.footage import StudySettings, group_on_disk
-from vergence_models.studies.networks import gather_networks, missing_tiers
+from vergence_models.studies.networks import TIERS, gather_networks
 from vergence_models.studies.plots import draw_plots
 from vergence_models.studies.tables import (
     StudyFileError,
@@ -54,6 +55,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     )
     add = parser.add_argument
     add("--json", type=Path, required=True, help="results; Markdown and PNGs go beside it")
+    add("--render", action="store_true", help="write Markdown and plots of FILE again, run nothing")
     add("--studies", nargs="*", metavar="NAME", help=f"of {', '.join(STUDIES)}; by default all")
     add("--weights", type=Path, nargs="+", default=[WEIGHTS], help="folders with a manifest")
     add("--run", type=Path, nargs="*", default=[], help="training runs, computed by PyTorch")
@@ -85,13 +87,19 @@ def chosen(given: argparse.Namespace, frames: int) -> dict[str, Study]:
     return {name: STUDIES[name] for name in STUDIES if name in given.studies} | extra
 
 
-def report(tables: dict[str, Table], missing: list[str], path: Path) -> None:
-    """Write everything that is known by now."""
+def report(tables: dict[str, Table], path: Path) -> None:
+    """Write all finished studies: JSON, Markdown and plots."""
     order = [*STUDIES, *sorted(set(tables) - set(STUDIES))]
     known = [tables[name] for name in order if name in tables]
     write_tables(path, known)
     drawn = draw_plots(known, path.parent)
-    path.with_suffix(".md").write_text(markdown(known, missing, drawn), "utf-8")
+    path.with_suffix(".md").write_text(markdown(known, missing_tiers(known), drawn), "utf-8")
+
+
+def missing_tiers(tables: list[Table]) -> list[str]:
+    """The tiers that no row of the studies is about."""
+    labels = [label for table in tables if table.name in STUDIES for label in table.labels]
+    return [tier for tier in TIERS if labels and not any(row.startswith(tier) for row in labels)]
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -111,8 +119,10 @@ def main(arguments: list[str] | None = None) -> None:
     columns = (SpinnerColumn(), *Progress.get_default_columns()[:1], TimeElapsedColumn())
     try:
         tables = read_tables(given.json)
+        if given.render:
+            report(tables, given.json)
+            return
         networks = gather_networks(given.weights, given.run, threads=given.threads)
-        missing = missing_tiers(networks)
         with Progress(*columns, console=Console(stderr=True)) as progress:
             bench = Bench(
                 networks,
@@ -124,7 +134,7 @@ def main(arguments: list[str] | None = None) -> None:
             for name, study in chosen(given, settings.frames).items():
                 log.info("study: %s", name)
                 tables[name] = study(bench)
-                report(tables, missing, given.json)
+                report(tables, given.json)
     except (
         ConfigError,
         FileNotFoundError,

@@ -140,9 +140,3 @@ def gather_networks(weights: list[Path], runs: list[Path], *, threads: int) -> l
         found.setdefault(studied.name, studied)
     order = {name: place for place, name in enumerate(TIERS)}
     return sorted(found.values(), key=lambda c: (order.get(c.tier, len(order)), c.name))
-
-
-def missing_tiers(networks: Iterable[StudiedNetwork]) -> list[str]:
-    """Tiers that nothing was given for."""
-    there = {studied.tier for studied in networks}
-    return [tier for tier in TIERS if tier not in there]

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from vergence_models.evaluation.number_format import cell, decimals
 
 FORMAT = 1
 
@@ -124,8 +126,12 @@ def _section(table: Table) -> str:
     headings = " | ".join(table.columns[key] for key in columns)
     lines = [f"## {table.title}", "", table.text, "", f"| | {headings} |"]
     lines.append("|---|" + "---:|" * len(columns))
-    lines += [_line(row.label, row, columns) for row in table.rows]
-    lines += [_line(f"*theirs, on their data:* {row.label}", row, columns) for row in table.paper]
+    rows = [*table.rows, *table.paper]
+    places = {
+        key: decimals(row.values[key] for row in rows if key in row.values) for key in columns
+    }
+    lines += [_line(row.label, row, places) for row in table.rows]
+    lines += [_line(f"*theirs, on their data:* {row.label}", row, places) for row in table.paper]
     if table.findings:
         lines += ["", *(f"- {finding}" for finding in table.findings)]
     if table.training:
@@ -135,6 +141,6 @@ def _section(table: Table) -> str:
     return "\n".join(lines)
 
 
-def _line(label: str, row: TableRow, columns: Sequence[str]) -> str:
-    cells = [f"{row.values[key]:.3g}" if key in row.values else "" for key in columns]
+def _line(label: str, row: TableRow, places: Mapping[str, int]) -> str:
+    cells = [cell(row.values.get(key), count) for key, count in places.items()]
     return f"| {label} | " + " | ".join(cells) + " |"

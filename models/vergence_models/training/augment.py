@@ -1,4 +1,4 @@
-"""What training does to clips: windows blown up to larger disparities, and flawed cameras."""
+"""Augmentation of clips: windows enlarged to larger disparities, and flawed cameras."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MAX_STRETCH = 4.0
 
 
 def stretched(clips: StereoClips, random: np.random.Generator, *, share: float) -> StereoClips:
-    """Each clip, with chance ``share``, as a window of it blown up to the whole size.
+    """Each clip, with probability ``share``, as a window of it enlarged to the whole size.
 
     Rows grow by up to :data:`MAX_STRETCH` and columns by less, so disparity grows with the rows;
     poses stay true because the camera matrix follows.

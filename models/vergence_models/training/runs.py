@@ -1,9 +1,10 @@
-"""What a training run leaves in its folder, and reading it back.
+"""The files of a training run, written and read.
 
-``checkpoint.pt`` holds all that going on needs (weights, their moving average, the optimizer, the
-random states, how far it came); it is replaced in one rename, so a kill leaves the old one whole.
-Those of large networks leave the large tensors to pieces beside it: ``average-*`` is enough to
-export, ``weights-*`` and ``optimizer-*`` to go on. ``log.jsonl`` has a line for every report.
+``checkpoint.pt`` holds everything that a resumed run needs: weights, their moving average, the
+optimizer, the random states and the progress. It is replaced in one rename, so a killed process
+leaves the old file whole. The large tensors of large networks lie in shards beside it: export needs
+``average-*``; a resumed run also needs ``weights-*`` and ``optimizer-*``. ``log.jsonl`` has a line
+for every report.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ class RunError(ValueError):
 
 @dataclass(slots=True)
 class TrainingProgress:
-    """How far a run has come, over all its sessions."""
+    """Totals of a run, over all its sessions."""
 
     steps: int = 0
     frames: int = 0
@@ -45,7 +46,7 @@ class TrainingProgress:
 
 @dataclass(frozen=True, slots=True)
 class Validation:
-    """What validation found after so many steps: errors by name, as ``validate`` gives them."""
+    """The errors of a validation after so many steps, by name, as ``validate`` returns them."""
 
     steps: int
     measured: dict[str, float]
@@ -53,14 +54,14 @@ class Validation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Run:
-    """The outcome of a run so far: what export and evaluation need."""
+    """The part of a run that export and evaluation need."""
 
     config_name: str
     network: NetworkConfig
     weights: dict[str, Tensor]  # moving average
     story: dict[str, Any]  # any JSON: command, steps, frames, minutes, device, seed
     measured: dict[str, Any]  # any JSON: the last validation
-    source: str = "a run"  # the file it came from
+    source: str = "a run"  # the checkpoint's path, for error messages
     history: list[Validation] = field(default_factory=list)
 
 

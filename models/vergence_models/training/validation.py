@@ -1,4 +1,4 @@
-"""How good a network is on held-out synthetic clips: the figures that choices are made by."""
+"""The errors of a network on held-out synthetic clips; decisions in training rest on them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def filmed(pool: ClipPool, indices: range) -> StereoClips:
 def predict(
     network: AnyNetwork, clips: StereoClips, device: torch.device, *, start: StepKind = START
 ) -> list[StepOutput]:
-    """What is found in every frame of the clips: cold in the first, then with one iteration."""
+    """The output of every frame of the clips: a cold start, then one iteration a frame."""
     matrices = uvd_transforms(clips, clips.world_from_left).to(device)
     steps: list[StepOutput] = []
     for frame in range(clips.frames):

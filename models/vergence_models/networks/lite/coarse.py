@@ -32,21 +32,21 @@ MIN_PX = 0.1  # no answer is nearer to infinity
 
 
 class CostFeatures(NamedTuple):
-    """What the scores of the wide search are made of, as far as two images alone say it."""
+    """The inputs of the cost filter that depend on the two images alone."""
 
     fixed: Tensor  # [B, D, H, W] at 1/8, largest disparity first: scores before anything learned
-    features: Tensor  # [B D, C, H/2, W/2]: what the learned filter sees of them
+    features: Tensor  # [B D, C, H/2, W/2]: input of the learned filter
 
 
 class CostFilter(nn.Module):
     """Coarse scores from the raw volume.
 
-    Box windows of three sizes, a doubt about matches that another surface claims too, and a learned
-    residual.
+    A score is the sum of box windows of three sizes, a penalty on matches that another surface
+    claims too, and a learned residual.
 
-    The residual is the same small network for every disparity (folded into the batch), told what
-    the image looks like and where the previous frame's surface lies: what it learns at one
-    disparity holds at all of them.
+    The residual is the same small network for every disparity (folded into the batch). Its inputs
+    include the image's context and the previous frame's surface. What it learns at one disparity
+    holds at all of them.
     """
 
     def __init__(self, config: LiteNetworkConfig) -> None:
@@ -94,7 +94,7 @@ class CostFilter(nn.Module):
 
 
 def coarse_position(d: Tensor, last: int) -> Tensor:
-    """Where disparity ``d`` px lies among the coarse scores, the last of which is that of 0 px."""
+    """The index of disparity ``d`` px among the coarse scores; the last one is that of 0 px."""
     return last - d * (1 / BIN_PX)
 
 
@@ -114,9 +114,9 @@ def peak(volume: Volume) -> tuple[Tensor, Tensor]:
 
 
 def smooth_fill(d: Tensor, confidence: Tensor) -> Tensor:
-    """What confident surroundings say: a pull-push pyramid of confidence-weighted means. [B,1,H,W].
+    """Fill from confident cells: a pull-push pyramid of confidence-weighted means, [B, 1, H, W].
 
-    Where a cell is confident it hears itself and its neighbours; on a blank wall, the wall's rim.
+    A confident cell is averaged with its neighbours; a cell on a blank wall takes the wall's rim.
     """
     weight = confidence + 1e-4
     both = torch.cat((d * weight, weight), dim=1)
@@ -132,8 +132,8 @@ def smooth_fill(d: Tensor, confidence: Tensor) -> Tensor:
 def extremes(d: Tensor, confidence: Tensor, otherwise: Tensor) -> Tensor:
     """The farthest and the nearest surface among confident neighbours, [B, 2, H, W].
 
-    The farthest is what an occluded cell shows, the nearest what a blank or thin thing is part of.
-    Mostly along the row; ``otherwise`` where no neighbour is confident.
+    An occluded cell shows the farthest; a blank or thin object is part of the nearest. The window
+    extends mostly along the row. Without a confident neighbour the result is ``otherwise``.
     """
     doubt = 1e3 * (confidence < 0.5).to(d.dtype)
     both = torch.cat((-d - doubt, d - doubt), dim=1)
@@ -146,16 +146,16 @@ def extremes(d: Tensor, confidence: Tensor, otherwise: Tensor) -> Tensor:
 
 
 def beyond(d: Tensor, *, scale: int) -> Tensor:
-    """How many cells the match lies beyond the left border of the right image, -1 to 1.
+    """The distance of the match beyond the left border of the right image, in cells, -1 to 1.
 
-    ``d`` [B, K, H, W] px at 1/``scale``. Nothing can match there: what looks like it is noise.
+    ``d`` [B, K, H, W] px at 1/``scale``. Nothing can match there: an apparent match is noise.
     """
     u, _ = cell_centres(d.shape[2], d.shape[3], scale, d)
     return ((d - u) * (1 / scale)).clamp(-1, 1)
 
 
 class CoarseUpdate(nn.Module):
-    """One iteration at 1/8: look at the scores round the current disparity, choose, correct."""
+    """One iteration at 1/8: read the scores around the current disparity, choose, correct."""
 
     def __init__(self, config: LiteNetworkConfig) -> None:
         super().__init__()
@@ -174,7 +174,7 @@ class CoarseUpdate(nn.Module):
         scores: Volume,
         context: Tensor,
     ) -> tuple[Tensor, Tensor, Hypotheses]:
-        """Hidden state and disparity [B, 1, H, W] px to the next ones; what was chosen among."""
+        """Return the next hidden state, the next disparity [B, 1, H, W] px, and the hypotheses."""
         peak_px, peak_log = guess
         top = scores.scores.amax(dim=-1)[:, None]
         around = lookup_row(scores, coarse_position(d, scores.last), REACH)
@@ -194,7 +194,7 @@ class CoarseUpdate(nn.Module):
         )
         hidden = self.cell(hidden, inputs)
         learned = self.out(F.relu(self.head(hidden)))
-        # Fixed part of the choice: the score itself, and a doubt about guesses that are not unique.
+        # The fixed part of the choice is the score, and a penalty on peaks that are not unique.
         kept, at_fills = log_p[:, REACH : REACH + 1], log_p[:, TAPS:]
         fixed = torch.cat((kept + 1, 2 * peak_log, at_fills - 1), dim=1)
         surfaces = torch.cat((d, peak_px, fills), dim=1)

@@ -1,14 +1,14 @@
-"""The network of `lite`: a wide coarse search, a narrow fine one, and time to join them.
+"""The network of `lite`: a wide coarse search and a narrow fine search, joined over time.
 
-The wide search is coarse (every disparity, cells of 1/8), the narrow one fine (a handful of
-hypotheses per cell of 1/4); time joins them: the previous disparity, moved to the new view, is what
-the wide search starts from, and what the answer of the narrow one is blended with where they agree.
-Choosing and blending is learned; matching itself starts from fixed census descriptors, so the
-untrained network is already a stereo matcher.
+The wide search covers every disparity in cells of 1/8. The narrow search weighs a few hypotheses
+per cell of 1/4. The previous disparity, warped to the new view, is the prior of the wide search,
+and the result of the narrow search is blended with it where the two agree. Choosing and blending
+is learned. Matching starts from fixed census descriptors, so the untrained network is already a
+stereo matcher.
 
-An iteration is all that depends on what is expected: both choices and the recurrent cell. The next
-iteration expects its answer, as the next frame does; so a second one is what seeing the same frame
-again would be, and a network that improves over frames improves over iterations.
+An iteration contains everything that depends on the prior: both choices and the recurrent cell. Its
+result is the prior of the next iteration, and of the next frame. So a second iteration acts like
+the same frame seen again, and a network that improves over frames also improves over iterations.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ from vergence_proto.model_io import StateTensor
 
 
 class LiteState(NamedTuple):
-    """What one step hands to the next, and within it one iteration to the next."""
+    """The recurrent state, from step to step and from iteration to iteration."""
 
     disparity: Tensor  # float32 [B, 1, H/4, W/4], full-resolution pixels, 0 = nothing known
     hidden: Tensor  # float32 [B, C, H/8, W/8]
 
 
 class MatchingFeatures(NamedTuple):
-    """What two images say by themselves: made once, whatever the iterations."""
+    """Features that depend on the two images alone; computed once for all iterations."""
 
     cost_features: CostFeatures
     pairs: Tensor  # at 1/4, see Near.pairs
@@ -61,7 +61,7 @@ class MatchingFeatures(NamedTuple):
 
 
 class CoarseEstimate(NamedTuple):
-    """What an iteration found at one scale, and what it chose among."""
+    """The disparity of an iteration at one scale below the full one, and its hypotheses."""
 
     disparity: Tensor  # [B, 1, H/scale, W/scale] px
     hypotheses: Hypotheses
@@ -75,11 +75,11 @@ class CoarseEstimate(NamedTuple):
 
 
 class Iteration(NamedTuple):
-    """What one iteration found."""
+    """The results of one iteration."""
 
     answer: Refined
     hidden: Tensor  # [B, C, H/8, W/8]
-    scores: Tensor  # of the wide search, as in LiteEstimate
+    scores: Tensor  # coarse scores, as in LiteEstimate
     guesses: tuple[CoarseEstimate, CoarseEstimate]
 
 
@@ -91,7 +91,7 @@ class LiteEstimate(Estimate):
     guesses: list[CoarseEstimate]  # at both scales, of each iteration
 
     def loss(self, truth_px: Tensor, max_disparity_px: int) -> Tensor:
-        """Of the answer, its sigma, both scales on the way, and the coarse scores themselves."""
+        """The sum of losses of disparity, sigma, both inner scales and the coarse scores."""
         loss = output_loss(self.disparity, self.sigma, truth_px, max_disparity_px)
         losses = [guess.loss(truth_px, max_disparity_px) for guess in self.guesses]
         loss = loss + 2 / len(losses) * added(losses)
@@ -140,7 +140,7 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
     def iterated(
         self, matching: MatchingFeatures, state: LiteState, iterations: int
     ) -> tuple[LiteEstimate, LiteState]:
-        """The answer after so many iterations, from a state in the view of this frame."""
+        """The estimate after so many iterations, from a state in the view of this frame."""
         guesses: list[CoarseEstimate] = []
         for _ in range(iterations):
             found = self.iterate(matching, state)
@@ -154,18 +154,18 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         return LiteState(*warp_state(*state, uvd_curr_from_prev, scale=4, hidden_scale=8))
 
     def search(self, left: Tensor, right: Tensor) -> MatchingFeatures:
-        """What the images say by themselves; [B, H, W, 3] uint8 each."""
+        """Compute all that depends on the images alone; uint8 [B, H, W, 3] each."""
         return MatchingFeatures(self.search_wide(left, right), *self.search_narrow(left, right))
 
     def search_wide(self, left: Tensor, right: Tensor) -> CostFeatures:
-        """All disparities, at 1/8."""
+        """The inputs of the wide search: all disparities, at 1/8."""
         pairs = all_pairs(
             self.coarse_descriptor(gray(left, 4), 2), self.coarse_descriptor(gray(right, 4), 1)
         )
         return self.cost_filter.cost_features(banded(pairs, self.bins))
 
     def search_narrow(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Pairs at 1/4, and the context: what :class:`MatchingFeatures` has besides those."""
+        """Pairs at 1/4 and the context: all other fields of :class:`MatchingFeatures`."""
         left_fine = self.fine_descriptor(gray(left, 2), 2)
         right_fine = self.fine_descriptor(gray(right, 2), 1)
         quarter, eighth, sixteenth = self.context(left)
@@ -173,7 +173,7 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         return pairs, quarter, eighth, self.cost_filter.context(sixteenth)
 
     def iterate(self, matching: MatchingFeatures, state: LiteState) -> Iteration:
-        """From the surface that is expected to a better one, by both searches."""
+        """Improve the prior disparity by both searches."""
         prior, hidden = state
         seen = (prior > 0).to(prior.dtype)
         seen8 = F.avg_pool2d(seen, 2)
@@ -204,7 +204,7 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
 def gray(image: Tensor, scale: int) -> Tensor:
     """Mean of the colours of blocks of pixels: uint8 [B, H, W, 3] to [B, 1, H/scale, W/scale].
 
-    Two rows speak for a block. Their sums are a product with ones: of bytes, that is quick.
+    Two rows represent a block. Their sums are a product with ones, which is fast on bytes.
     """
     batch, height, width, _ = image.shape
     ones = torch.eye(32 // scale, device=image.device).repeat_interleave(3 * scale, dim=0)
