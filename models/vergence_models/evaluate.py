@@ -1,4 +1,4 @@
-"""``python -m vergence_models.evaluate --json FILE``: how good an exported model is, beside SGBM.
+"""``python -m vergence_models.evaluate --json FILE``: the errors of a model and of SGBM.
 
     python -m vergence_models.evaluate --json out.json --data vergence:DIR --pool pool/val
 
@@ -43,7 +43,7 @@ Results = dict[str, dict[str, MetricAccumulator]]  # group -> method -> its figu
 
 
 def methods_for(network: SteppedNetwork, *, thorough: bool) -> list[Method]:
-    """The network warm and cold, SGBM; ``thorough``: also told no motion, and noisy motion."""
+    """The network warm and cold, and SGBM; ``thorough`` adds no motion and noisy motion."""
     name, most = network.card.name, max(network.card.graphs)
     warm = warm_method(network, name, 1, cold=most)
     methods = [warm, single_frame_method(network, name, most)]
@@ -175,7 +175,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--model", default="lite")
     parser.add_argument("--data", nargs="*", default=[], help="KIND:PATH, as vergence run takes it")
     parser.add_argument("--pool", type=Path, nargs="*", default=[], help="held-out clips")
-    parser.add_argument("--clips", type=int, default=32, help="of each pool")
+    parser.add_argument("--clips", type=int, default=32, help="clips of each pool")
     parser.add_argument("--thorough", action="store_true", help="also without and with noisy poses")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--json", type=Path, help="written with a .md of the same name beside it")

@@ -1,4 +1,4 @@
-"""The value that the generator and the pools hand to training: a batch of stereo clips."""
+"""A batch of stereo clips: the value that generator and pools pass to training."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Things that stand in rooms and streets, each built at the origin of a frame on the floor."""
+"""Objects in rooms and streets, each built at the origin of a frame on the floor."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Maker = Callable[[Builder, MaterialPalette, np.random.Generator, float], None]
 
 
 def table(b: Builder, palette: MaterialPalette, rng: np.random.Generator, s: float) -> None:
-    """A table with four legs or one, and things on it. `s` scales, as in all of these."""
+    """A table with four legs or one, and objects on it. `s` is the scale, as in all makers."""
     top = palette.textured(s, "wood", "photo", "clouds", "tiles")
     w, d, h = rng.uniform(0.4, 0.9) * s, rng.uniform(0.3, 0.6) * s, rng.uniform(0.4, 0.8) * s
     thick = 0.02 * s

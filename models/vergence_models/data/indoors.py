@@ -1,4 +1,4 @@
-"""Indoor settings: furnished rooms, and close-ups of cluttered tables and floors."""
+"""Indoor scenes: furnished rooms, and close-ups of cluttered tables and floors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Open settings: streets under the sky, and swarms of things before a far background."""
+"""Outdoor scenes: streets under the sky, and swarms of objects before a far background."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which primitive does each pixel see, and how deep: tiled ray casting, batched over views.
+"""Tiled ray casting, batched over views: the visible primitive of each pixel, and its depth.
 
 Primitives are binned into square tiles of the image by the bounds of their boxes, so a ray meets
 only the few primitives near it. Depth is that of the exact ray through the pixel centre.
@@ -47,7 +47,7 @@ class Cameras(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RayHits:
-    """What the pixel centres of V views see."""
+    """The first hits of the rays through the pixel centres of V views."""
 
     depth_m: Tensor  # float32 [V, H, W] along the optical axis; infinite where nothing is hit
     primitive: Tensor  # int64 [V, H, W], index m into `Primitives`; -1 where nothing is hit

@@ -180,7 +180,7 @@ def _neighbours(surface: Tensor) -> Tensor:
 
 
 def _nearest_of(primitives: Primitives, candidates: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """Which of K candidates [K, N] rays [N, S] hit first: 0 where they slip through them all."""
+    """The index of the first of K candidates [K, N] that rays [N, S] hit; 0 if they hit none."""
     depth = torch.full(x.shape, float("inf"), device=x.device)
     # Candidate -1 is the sky, behind everything; the pixel's own stands in where there is none.
     backdrop = torch.zeros_like(candidates[0])
@@ -215,7 +215,7 @@ def _develop(color: Tensor, shots: list[Shot]) -> Tensor:
 
 
 def _visible_in_right(left: Tensor, right: Tensor) -> Tensor:
-    """Whether the surface point of each left pixel is seen by the right eye: bool, as `left`.
+    """A mask of left pixels whose surface point the right eye sees: bool, as `left`.
 
     Between two neighbouring pixels of the right image a plane's disparity is linear, so a point is
     hidden only where both of them are nearer than it.

@@ -103,7 +103,7 @@ def living_room(kinds: tuple[str, ...]) -> Scene:
 
 
 class _Decor(MaterialPalette):
-    """A palette with one given wood or cloth, and book covers for the rest."""
+    """A palette with one fixed wood or cloth, and book covers for everything else."""
 
     def __init__(self, rng: np.random.Generator, kinds: tuple[str, ...], wood: Material) -> None:
         super().__init__(rng, kinds)

@@ -1,7 +1,7 @@
-"""The final pass: what a real pair of cameras does to clean images. Ground truth stays as it is.
+"""The flaws of real cameras, added to clean images. Ground truth stays as it is.
 
-Every effect is drawn anew for each clip from one numpy generator, so a pool of clean clips gives
-new pictures in every epoch.
+Every effect is drawn for each clip from one numpy generator, so a pool of clean clips yields new
+images in every epoch.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _NOISE_POOL = 1 << 20  # normal numbers drawn a batch; frames take random stretc
 
 @dataclass(frozen=True, slots=True)
 class SensorConfig:
-    """Chances of each effect in a clip, and how strong it gets at most."""
+    """The probability of each effect in a clip, and its largest strength."""
 
     noise: float = 0.8
     noise_levels: float = 7.0  # standard deviation, grey levels
@@ -42,7 +42,7 @@ class SensorConfig:
 def film_as_sensor(
     clips: StereoClips, rng: np.random.Generator, config: SensorConfig | None = None
 ) -> StereoClips:
-    """The same clips as cameras with flaws would have recorded them (works on the CPU)."""
+    """The same clips, as recorded by cameras with flaws (computed on the CPU)."""
     config = config or SensorConfig()
     noise = rng.standard_normal(_NOISE_POOL, dtype=np.float32)
     left, right = torch.empty_like(clips.left), torch.empty_like(clips.right)

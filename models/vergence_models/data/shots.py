@@ -29,8 +29,8 @@ class Mix:
 class Playback:
     """A calm head's motion, played back faster: one scene, one path and one last view.
 
-    Only the past differs between clips of different speeds, so what the speed costs can be told
-    from what the camera happens to see.
+    Only the past differs between clips of different speeds, so the effect of speed is separate
+    from the content of the view.
     """
 
     speed: float = 1.0

@@ -1,4 +1,4 @@
-"""What the settings of shots share: the viewpoint, places in view, things afloat, light.
+"""Helpers of all scenes: the viewpoint, places in view, floating objects, light.
 
 The camera stands over the world's origin and looks along z; the surroundings are turned about it.
 """
@@ -17,11 +17,11 @@ from vergence_models.data.shapes import Cutout, Shape
 
 @dataclass(frozen=True, slots=True)
 class Viewpoint:
-    """What a setting needs to know of the camera."""
+    """The properties of the camera that a scene is built for."""
 
     half_angle: float  # radians from the axis to the left and right, head motion included
     aspect: float  # height / width
-    nearest_m: float  # nothing may come nearer
+    nearest_m: float  # the smallest distance of any object
     baseline_m: float
 
     @property
@@ -34,7 +34,7 @@ def float_about(
     b: Builder, palette: MaterialPalette, rng: np.random.Generator, view: Viewpoint, count: int, *,
     far_m: float, up_m: float, moving: float, large: bool = False,
 ) -> None:  # fmt: skip
-    """Things afloat in view, some of them travelling and spinning."""
+    """Add floating objects in view, some of them moving and spinning."""
     for _ in range(count):
         near = view.nearest_m
         # Uniform in disparity, so that all disparities occur alike.

@@ -1,6 +1,6 @@
-"""The contestants of evaluation and studies: whatever turns footage into disparity.
+"""The methods of evaluation and studies: each turns footage into disparity.
 
-A method has a name and may be told something else than the truth about the camera's motion.
+A method has a name, and may see changed footage, for example with noisy camera motion.
 """
 
 from __future__ import annotations
@@ -70,15 +70,15 @@ def sgbm_methods() -> list[Method]:
 
 
 def without_poses(footage: Footage) -> Footage:
-    """The network is told that nothing moves, so its state stays where it was."""
+    """Footage without camera motion: the network's state keeps its place."""
     return replace(footage, views=[replace(v, world_from_left=None) for v in footage.views])
 
 
 def with_pose_noise(footage: Footage, *, deg: float, m: float) -> Footage:
-    """The network is told motions that are off by just so much, from each frame to the next.
+    """Footage whose motion from each frame to the next is off by exactly this much.
 
-    The axis and the direction of each error are random, and the same whatever its size. Footage
-    without poses stays as it is.
+    The axis and the direction of each error are random, and the same for every size of the error.
+    Footage without poses stays as it is.
     """
     poses = [view.world_from_left for view in footage.views]
     if not (deg or m) or any(pose is None for pose in poses):

@@ -11,7 +11,7 @@ import numpy as np
 from vergence_models.evaluation.metrics import calibration, error_measures, temporal_error
 from vergence_models.evaluation.stepping import Footage, FootageView, Prediction
 
-FRAME_PIXELS = 640 * 480  # times are told for a frame of this size
+FRAME_PIXELS = 640 * 480  # times are reported for a frame of this size
 SETTLED = 1.1  # a start has settled once it is within 10 % of the later mean
 
 
@@ -25,7 +25,7 @@ class MetricAccumulator:
     by_index: dict[int, list[float]] = field(default_factory=dict)  # frame -> EPEs
     cpu_s: float = 0.0
     wall_s: float = 0.0
-    size: float = 0.0  # frames of FRAME_PIXELS
+    size: float = 0.0  # all pixels so far, in frames of FRAME_PIXELS
 
     def add(self, footage: Footage, predictions: Iterator[Prediction]) -> None:
         before: tuple[FootageView, Prediction] | None = None

@@ -1,7 +1,7 @@
-"""Int8 graphs of a tier: ranges and rounding found on some clips, the loss measured on others.
+"""Int8 graphs of a tier: ranges and rounding from some clips, the loss measured on others.
 
-The clips are synthetic, of the kind that validation uses. Each graph steps through them with its
-own state, so that the ranges are those of recurrent use.
+The clips are synthetic, like those of validation. Each graph steps through them with its own state,
+so the ranges are those of recurrent use.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from vergence_proto.model_io import DISPARITY, LEFT, RIGHT, UVD_CURR_FROM_PREV, 
 Array = NDArray[np.generic]
 
 RANGE_CLIPS = 4
-MEASURED_CLIPS = 16  # those that follow
+MEASURED_CLIPS = 16  # the clips after those
 BATCH = 4
 # A byte's step in the features moves 99 of 100 pixels by less than this. Where two hypotheses are
 # equally good it may tip the choice, as the order of sums does in float32.
@@ -36,7 +36,7 @@ MAX_LOSS = 1.03  # EPE of the int8 graph over that of the float one
 
 
 class QuantizationError(RuntimeError):
-    """An int8 graph loses too much, or computes something else on another CPU."""
+    """An int8 graph loses too much accuracy, or would differ on another CPU."""
 
 
 def make_int8(
@@ -46,7 +46,7 @@ def make_int8(
     *,
     max_disparity_px: float,
 ) -> tuple[dict[StepKind, ModelProto], dict[str, object]]:
-    """Int8 graphs of float ones, and the story for the manifest.
+    """Int8 graphs of float graphs, and their entry of the manifest.
 
     Raises QuantizationError if the smallest loses more than :data:`MAX_LOSS`, or if a product in
     any of them may overflow 16 bits.
@@ -93,7 +93,7 @@ def steps(
     *,
     forget: bool = False,
 ) -> Iterator[dict[str, Array]]:
-    """Step a graph through clips: after every frame the named tensors.
+    """Step a graph through clips and yield the named tensors after every frame.
 
     The first frame starts cold, with ``forget`` every frame.
     """
@@ -125,7 +125,7 @@ def steps(
 
 
 def scales_of(seen: Iterable[Mapping[str, Array]], names: Sequence[str]) -> dict[str, ByteScale]:
-    """For each tensor the scale that covers all that it holds."""
+    """The scale of each tensor that covers all values seen."""
     low, high = dict.fromkeys(names, 0.0), dict.fromkeys(names, 0.0)
     for found in seen:
         for name, values in found.items():

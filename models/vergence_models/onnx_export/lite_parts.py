@@ -1,4 +1,4 @@
-"""The step of `lite` in the parts that its graphs are stitched from."""
+"""The parts of a step of `lite`, from which its graphs are stitched."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ GIVEN = (*CostFeatures._fields, *NARROW)
 
 
 class Wide(StepModule[LiteNetwork]):
-    """The wide search, and the state moved to the new view."""
+    """The inputs of the wide search, and the state warped to the new view."""
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         left, right, matrix, *state = inputs
@@ -37,7 +37,7 @@ class Wide(StepModule[LiteNetwork]):
 
 
 class Narrow(StepModule[LiteNetwork]):
-    """The narrow search's volume, and the context. It takes about as long as the other."""
+    """The volume of the narrow search, and the context. It takes about as long as the wide part."""
 
     def forward(self, *images: Tensor) -> tuple[Tensor, ...]:
         left, right = images
@@ -77,7 +77,7 @@ class Join(StepModule[LiteNetwork]):
 
 
 def parts_of(network: LiteNetwork) -> StepParts[GraphPart]:
-    """Both searches, one iteration, and the way to full size."""
+    """The parts: both searches, one iteration, and the upsampling to full size."""
     stride = network.config.stride
     contract = StepContract.of(network)
     inputs, sizes = contract.inputs, contract.sizes
@@ -124,7 +124,7 @@ def parts_of(network: LiteNetwork) -> StepParts[GraphPart]:
 
 
 def refine_at_2x(network: LiteNetwork) -> RefinementAt2x[GraphPart]:
-    """The way to twice the size and back."""
+    """The parts that go to twice the size and back."""
     contract = StepContract.of(network)
     (left, right, _, *state), (image, *_) = contract.inputs, contract.sizes
     given, outputs = contract.input_names, contract.output_names
@@ -154,6 +154,6 @@ def refine_at_2x(network: LiteNetwork) -> RefinementAt2x[GraphPart]:
 
 
 def found_sizes(stride: int) -> tuple[Sizes, ...]:
-    """Of what a step finds in images that are multiples of ``stride``."""
+    """Sizes of a step's outputs, for images that are multiples of ``stride``."""
     plane: Sizes = {0: BATCH, 1: stride * ROWS, 2: stride * COLUMNS}
     return plane, plane, cells(stride, 4), cells(stride, 8)

@@ -1,4 +1,4 @@
-"""From modules to ONNX graphs: parts of a step, to be stitched."""
+"""Export of modules, each a part of a step, to ONNX graphs that can be stitched."""
 
 from __future__ import annotations
 
@@ -28,24 +28,24 @@ Network = TypeVar("Network", bound=nn.Module)
 
 
 class StepModule(nn.Module, Generic[Network]):
-    """A part of a network's step, from tensors to tensors: ``forward`` is what remains to say."""
+    """A part of a network's step, from tensors to tensors; subclasses define ``forward``."""
 
     def __init__(self, network: Network) -> None:
         super().__init__()
         self.network = network
 
     def examples(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """What it gives, for the part that takes it."""
+        """Example outputs, which are example inputs of the next part."""
         return tuple(tensor.detach() for tensor in self(*inputs))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GraphPart:
-    """A module to export, and what goes in and out of it: tensors alone, by name."""
+    """A module to export, with its inputs and outputs: tensors alone, by name."""
 
     module: nn.Module
-    inputs: tuple[Tensor, ...]  # examples
-    sizes: tuple[Sizes, ...]  # of the inputs
+    inputs: tuple[Tensor, ...]  # example inputs
+    sizes: tuple[Sizes, ...]  # the varying dimensions of each input
     input_names: tuple[str, ...]
     output_names: tuple[str, ...]
 
@@ -101,7 +101,7 @@ def export_part(part: GraphPart, path: Path) -> None:
 
 
 def join_clamps(model: onnx.ModelProto) -> None:
-    """Make one operator of a clamp to a size, which the exporter writes as a Max and a Min."""
+    """Make one Clip of a clamp, which the exporter writes as a Max and a Min."""
     graph = model.graph
     scalars = {tensor.name for tensor in graph.initializer if not tensor.dims}
     scalars |= {value.name for value in graph.value_info if is_scalar(value)}
@@ -126,7 +126,7 @@ def is_scalar(value: onnx.ValueInfoProto) -> bool:
 
 
 def slim(path: Path) -> None:
-    """Drop what the exporter notes: stack traces, file paths, and sizes in an order of chance."""
+    """Drop the exporter's notes: stack traces, file paths, and sizes in a random order."""
     model = onnx.load(path)
     join_clamps(model)
     for node in model.graph.node:
@@ -138,7 +138,7 @@ def slim(path: Path) -> None:
 
 
 def folded(network: Network) -> Network:
-    """A copy that computes the same with every batch norm folded into its convolution."""
+    """A copy with the same results, where every batch norm is folded into its convolution."""
     network = copy.deepcopy(network).eval()
     for module in network.modules():
         if not isinstance(module, nn.Sequential):

@@ -1,4 +1,4 @@
-"""The step of `full` and `fast` in the three parts that their graphs are stitched from."""
+"""The three parts of a step of `full` and `fast`, from which their graphs are stitched."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Begin(StepModule[RaftNetwork]):
 class Iterate(StepModule[RaftNetwork]):
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         given, moving = RaftGiven(*inputs[:3]), RaftState(*inputs[3:])
-        # Every iteration makes the pyramid anew; onnxruntime drops the repetitions.
+        # Every iteration builds the pyramid again; onnxruntime drops the repetitions.
         return self.network.iterate(given, pyramid(given.pairs), moving)
 
 
@@ -40,7 +40,7 @@ class End(StepModule[RaftNetwork]):
 
 
 def parts_of(network: RaftNetwork) -> StepParts[GraphPart]:
-    """What comes before the iterations, one of them, and what comes after."""
+    """The part before the iterations, one iteration, and the part after them."""
     given, moving = RaftGiven._fields, tuple(f"at_{name}" for name in RaftState._fields)
     moved = tuple(TAKES_PLACE + name for name in moving)
     stride, cell = network.config.stride, network.config.stride // CELL_PX

@@ -1,4 +1,4 @@
-"""Runs methods over groups of footage, once each, however many studies ask."""
+"""Runs each method over each group of footage once, for all studies."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The studies, each a question about the same networks, answered with a table."""
+"""The studies: each asks one question about the same networks and answers it with a table."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def training_of(networks: Sequence[StudiedNetwork]) -> list[str]:
 
 
 def times(bench: Bench) -> Table:
-    """What a frame costs."""
+    """Measure the time of a frame."""
     found = step_times_ms(every_method(bench), rounds=bench.settings.timed)
     rows = [
         TableRow(label, {"ms": round(ms, 2), "fps": round(1e3 / ms, 3), "cpu_ms": round(cpu_ms, 2)})
@@ -94,7 +94,7 @@ def main_table(bench: Bench) -> Table:
 
 
 def warp_ablation(bench: Bench) -> Table:
-    """The same network, its state moved, left where it was, and thrown away."""
+    """Compare one network with its state warped, kept in place, and discarded."""
     variants: dict[str, Method] = {}
     for studied, warm in one_iteration(bench):
         if studied.warps:
@@ -130,7 +130,7 @@ def warp_ablation(bench: Bench) -> Table:
 
 
 def not_moved(studied: StudiedNetwork, method: Method) -> Method:
-    """The same without poses; what has no warp needs none."""
+    """The same method without poses; a network without warp ignores them anyway."""
     return method.with_input("state not moved", without_poses) if studied.warps else method
 
 
@@ -200,7 +200,7 @@ def with_noise_level(method: Method, level: int) -> Method:
 
 
 def cold_start(bench: Bench) -> Table:
-    """How long a stream takes to settle."""
+    """Measure the frames that a stream takes to settle."""
     methods = []
     for studied, warm in one_iteration(bench):
         methods += [warm, *studied.single_frame_methods()[-1:]]

@@ -1,7 +1,7 @@
-"""What the studies look at: held-out clips at set speeds, and sources on disk.
+"""The footage of the studies: held-out clips at set speeds, and sources on disk.
 
-Clips come from a cache that is rendered once: the same scenes and camera paths at every speed,
-with seeds that no training uses.
+Clips are rendered once into a cache: the same scenes and camera paths at every speed, with seeds
+that no training uses.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ ROOMS = Mix(streets=0.0, swarms=0.0, clutter=0.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FootageGroup:
-    """Sequences that are judged together; read anew each time, never all in memory."""
+    """Sequences that are measured together; read again each time, never all in memory."""
 
     name: str
-    words: str  # for a reader of the tables
-    frames: int  # at most so many of each sequence
+    words: str  # description for readers of the tables
+    frames: int  # most frames of each sequence
     read: Callable[[], Iterable[Footage]]
     last_only: bool = False  # judge the last frame alone
 
@@ -43,15 +43,15 @@ class FootageGroup:
 
 @dataclass(frozen=True, slots=True)
 class StudySettings:
-    """How many held-out clips, and of what size; how long to measure times."""
+    """The number and size of held-out clips, and the number of timed frames."""
 
     clips: int = 12
     frames: int = 30  # one second of a headset's camera
-    short: int = 12  # of clips that only a change of speed or of poses is studied on
+    short: int = 12  # frames of the clips on which speed and pose noise are studied
     width: int = 320
     height: int = 256
     textures: Path | None = None  # a folder of photographs; None: procedural textures only
-    timed: int = 5  # frames of each method
+    timed: int = 5  # frames of each method that are timed
 
 
 def clips_at(speed: int, settings: StudySettings, cache: Path, *, workers: int) -> FootageGroup:

@@ -1,4 +1,4 @@
-"""How far the runs have come, from their own logs: what every other table must be read with."""
+"""Learning curves of the runs, from their own logs; every other table must be read with them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ COLUMNS = {
 
 
 def learning_curves(bench: Bench) -> Table:
-    """How far each run has come, and whether it still falls."""
+    """Show the progress of each run, and if its error still falls."""
     runs = [studied for studied in bench.networks if studied.history]
     rows, curves = [], []
     for studied in runs:

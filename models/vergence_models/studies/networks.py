@@ -23,7 +23,7 @@ COLD = 8  # iterations on the first frame of a warm sequence, at most
 
 @dataclass(frozen=True, slots=True)
 class TrainingSummary:
-    """How far a network was trained: what every figure of it must be read with."""
+    """The amount of training of a network, which every figure of it must be read with."""
 
     name: str
     runtime: str
@@ -33,7 +33,7 @@ class TrainingSummary:
 
     @classmethod
     def of(cls, name: str, runtime: str, story: dict[str, Any]) -> TrainingSummary:
-        """``story``: any JSON, as a run tells it and a manifest repeats it."""
+        """``story``: any JSON, as a run records it and a manifest repeats it."""
         return cls(
             name,
             runtime,

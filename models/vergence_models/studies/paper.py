@@ -1,4 +1,4 @@
-"""What the paper reports, for reading beside ours.
+"""The paper's figures, to be read beside ours.
 
 Z. Cheng, J. Yang, H. Li: Stereo Matching in Time: 100+ FPS Video Stereo Matching for Extended
 Reality, WACV 2024, arXiv 2309.04183. Their networks, fully trained, on their XR-Stereo data set at

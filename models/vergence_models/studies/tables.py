@@ -1,4 +1,4 @@
-"""What a study leaves behind: a table, its curves, and what it says. JSON and Markdown of it."""
+"""The result of a study: a table, its curves and its findings, as JSON and Markdown."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ TIME_COLUMNS = {"ms": "ms", "fps": "FPS", "cpu_ms": "CPU ms"}  # joined from the
 
 
 class StudyFileError(ValueError):
-    """A JSON file to add to is not one of studies."""
+    """The JSON file holds no studies."""
 
 
 @dataclass(frozen=True, slots=True)
 class TableRow:
     label: str
-    values: dict[str, float]  # by the keys of the table's columns; what is unknown is left out
+    values: dict[str, float]  # column key -> value; unknown values are missing
 
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """EPE in px over whatever the study varies. A dashed one is drawn beside its like."""
+    """EPE in px over the variable of the study. A dashed curve belongs to a solid one."""
 
     label: str
     x: list[float]
@@ -43,12 +43,12 @@ class Table:
 
     name: str
     title: str
-    text: str  # what was done, on what
+    text: str  # the experiment and its data
     columns: dict[str, str]  # key -> heading
     rows: list[TableRow]
     training: list[str]
     findings: list[str] = field(default_factory=list)
-    paper: list[TableRow] = field(default_factory=list)  # theirs, on their data
+    paper: list[TableRow] = field(default_factory=list)  # the paper's figures, on its data
     paper_note: str = ""
     curves: list[Curve] = field(default_factory=list)
     x_label: str = ""

@@ -73,12 +73,13 @@ def save_checkpoint(folder: Path, contents: dict[str, Any]) -> None:
     index = {"format": SHARDED_FORMAT, **contents}
     names: dict[str, list[str]] = {}
     for part, half in HALF.items():
-        index[part], pieces = split(contents[part], half)
-        # New names for new pieces: the old ones stay valid until the index is replaced.
+        index[part], shards = split(contents[part], half)
+        # New names for new shards: the old ones stay valid until the index is replaced.
         steps = contents["progress"]["steps"]
-        names[part] = [f"{part}-{steps:08d}-{number}.pt" for number in range(len(pieces))]
-        for name, piece in zip(names[part], pieces, strict=True):
-            save(folder / name, piece)
+        names[part] = [f"{part}-{steps:08d}-{number}.pt" for number in range(len(shards))]
+        for name, shard in zip(names[part], shards, strict=True):
+            save(folder / name, shard)
+    # "pieces" is the key of the format on disk: older runs have it.
     save(folder / CHECKPOINT_NAME, {**index, "pieces": names})
     kept = {name for part in names.values() for name in part}
     for part in HALF:

@@ -132,7 +132,7 @@ class Trainer:
         )
 
     def resume(self, folder: Path) -> None:
-        """Go on from a run's checkpoint. Raises RunError if it is of another configuration."""
+        """Continue from a run's checkpoint. Raises RunError if its configuration differs."""
         contents = load_checkpoint(folder)
         require_same_network(contents, self.config, folder / CHECKPOINT_NAME)
         load_weights(self.network, contents["weights"], str(folder / CHECKPOINT_NAME))
@@ -152,7 +152,7 @@ class Trainer:
         return bool(self.random.random() < share)
 
     def transforms(self, clips: StereoClips) -> Tensor:
-        """The motion the network is told, float32 [B, T, 4, 4]: true, noisy, or none at all."""
+        """The motion that the network sees, float32 [B, T, 4, 4]: true, noisy, or none."""
         training = self.config.training
         poses = clips.world_from_left
         if self.chance(training.identity_share):

@@ -33,7 +33,7 @@ class Eye(IntEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameTruth:
-    """Of the left view but where it says otherwise; see `truths` for shapes and frames."""
+    """Truth of the left view, unless named otherwise; see `truths` for shapes and frames."""
 
     disparity_px: truths.Plane
     right_disparity_px: truths.Plane
@@ -66,7 +66,7 @@ class StereoCamera:
         return right_of(left, self.recipe.baseline_m) if eye is Eye.RIGHT else left
 
     def clean(self, frame: int, eye: Eye) -> Image:
-        """A pinhole and an instant: nothing but geometry and light."""
+        """The image of a pinhole camera at one instant: geometry and light alone."""
         time_s = self.path.frame_time_s(frame)
         light = self._tracer.light(
             self.optics, self.world_from_eye(time_s, eye), time_s,
@@ -75,7 +75,7 @@ class StereoCamera:
         return self._developed(light, frame, eye)
 
     def final(self, frame: int, eye: Eye) -> Image:
-        """The same moment through a lens, an open shutter and rows read one by one."""
+        """The same moment seen through a lens, with an exposure time and a rolling shutter."""
         recipe = self.recipe
         time_s = self.path.frame_time_s(frame)
         instants = effects.schedule(recipe.effects, recipe.height, self._moved_px(time_s))
@@ -154,7 +154,7 @@ class StereoCamera:
         return self._gain
 
     def _moved_px(self, time_s: float) -> float:
-        """How far what is a metre away moves in the image while a row is open."""
+        """The motion in the image of a point at one metre while a row is open, in px."""
         half_s = self.recipe.effects.exposure_s / 2
         start, end = (self.path.world_from_left(time_s + dt) for dt in (-half_s, half_s))
         turned = np.linalg.norm(start[:3, :3].T @ end[:3, :3] - np.eye(3)) / np.sqrt(2)

@@ -98,7 +98,7 @@ class FloorPlan:
         return bench
 
     def against(self, side: Wall, name: str, make: Maker) -> None:
-        """Build a thing and put it with its back to a wall, or leave it out if nothing is free."""
+        """Build a thing and put it with its back to a wall; omit it if no place is free."""
         bench = self._built(make)
         low, high = _bounds(bench)
         width, away = self._extent(side)
@@ -120,7 +120,7 @@ class FloorPlan:
         return None
 
     def hang(self, side: Wall, surface: Surface, half_x: float, half_y: float, y_m: float) -> None:
-        """A picture or a mirror in a frame on a wall; left out where another one hangs."""
+        """Hang a picture or a mirror in a frame on a wall; omit it where another one hangs."""
         width, away = self._extent(side)
         bench, wood = Workbench(), self._palette.wood()
         bench.add(surface, meshes.sheet(half_x, half_y), (0, 0, -0.021))

@@ -21,7 +21,7 @@ Plane = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """Where the points that pixels see are in another frame; NaN behind that camera."""
+    """The position in another frame of the points that pixels see; NaN behind that camera."""
 
     flow_px: Plane  # [H, W, 2]: then minus now
     depth_m: Plane  # [H, W]: then, along the optical axis
