@@ -24,7 +24,7 @@ FACES = 8  # surface index = primitive * FACES + face
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Illumination:
-    """What shading needs of V views, as columns: lights in view axes, ambient, sky, shadow map."""
+    """Light of V views, as columns: lights in view axes, ambient light, sky, shadow map."""
 
     columns: Tensor  # float32 [C, V]; see `illumination_columns`
     shadow_depth_m: Tensor  # float32 [S, R, R], one map a scene
@@ -231,7 +231,7 @@ def _unit(vector: Tensor) -> Tensor:
 
 
 def _surroundings(bank: TextureBank, direction: Tensor, by_view: Tensor) -> Tensor:
-    """What lies at infinity in a direction (view axes) [3, N]: the sky texture wrapped around."""
+    """The colour at infinity in a direction (view axes) [3, N]: the sky texture wrapped around."""
     world = by_view[_WORLD : _WORLD + 9].view(3, 3, -1)
     x, y, z = (_dot(world[i], direction) for i in range(3))
     azimuth = torch.atan2(x, z)

@@ -42,10 +42,10 @@ def error_measures(predicted_px: Plane, truth_px: Plane) -> dict[str, float] | N
 
 
 def calibration(predicted_px: Plane, sigma_px: Plane, truth_px: Plane) -> dict[str, float] | None:
-    """How far sigma says what the error is.
+    """The calibration of sigma.
 
-    The shares of errors, in percent, within the 10 % to 90 % intervals of a Laplace distribution of
-    scale sigma, and the ratio of the means.
+    Returns the shares of errors, in percent, within the 10 % to 90 % intervals of a Laplace
+    distribution of scale sigma, and the ratio of the means.
     """
     known = np.isfinite(truth_px)
     if known.sum() < MIN_PIXELS:

@@ -37,9 +37,10 @@ def whole_rows(scores: Tensor) -> Volume:
 
 
 class Near(NamedTuple):
-    """Which right entries a left cell meets: those up to ``reach`` to the left of its own.
+    """The right entries that a left cell is matched with: up to ``reach`` to the left of its own.
 
-    And ``margin`` on either side of these, and some more: a block of columns shares its window.
+    The window extends by ``margin`` on either side, and by a little more, since all cells of a
+    block of columns share one window.
     """
 
     ratio: int  # right entries per left cell
@@ -76,7 +77,7 @@ class Near(NamedTuple):
         return torch.matmul(right_rows, left_rows)
 
     def volume(self, pairs: Tensor) -> Volume:
-        """Of what :meth:`pairs` gave."""
+        """A volume from the result of :meth:`pairs`."""
         count, block = pairs.shape[3:]
         blocks = torch.arange(BLOCKS, device=pairs.device)[:, None]
         within = torch.arange(block, device=pairs.device)
@@ -89,8 +90,8 @@ class Near(NamedTuple):
 def lookup(volume: Volume, position: Tensor) -> Tensor:
     """Linear interpolation at ``position`` [B, K, H, W], in entries; the result is of that shape.
 
-    No gradient flows to the position: a disparity learns from its own loss, not from wishing to
-    have been looked up elsewhere, which would blow up over iterations and frames.
+    No gradient flows to the position: a disparity learns from its own loss. A gradient through
+    the lookup would blow up over iterations and frames.
     """
     position = position.detach()
     low = torch.floor(position)

@@ -20,7 +20,7 @@ from vergence_proto.datasets import DatasetError
 
 
 def _option(field: str, text: str) -> typer.models.OptionInfo:
-    """Of a field that every chosen recipe takes from the command line, where it is given."""
+    """An option that replaces a field of every chosen recipe."""
     option: typer.models.OptionInfo = typer.Option(
         help=f"{text} The recipe's own ({getattr(Recipe(KINDS[0]), field):g}) if not given."
     )
@@ -52,12 +52,12 @@ def main(
         Path | None, typer.Option(help="A PNG of the last sequence's first frame, all truths.")
     ] = None,
     list_: Annotated[
-        bool, typer.Option("--list", help="Tell what the sets hold, and stop.")
+        bool, typer.Option("--list", help="Print the contents of the sets, and stop.")
     ] = False,
 ) -> None:
     """Path-trace stereo sequences of indoor scenes with every ground truth.
 
-    `--set benchmark --out DIR` renders the whole benchmark; a stopped run goes on where it was.
+    `--set benchmark --out DIR` renders the whole benchmark; a stopped run continues.
     `vergence run sceneflow:DIR/frames_finalpass/NAME` reads a sequence.
     """
     console = Console()
@@ -81,7 +81,7 @@ def main(
     except (BadRecipe, NoRenderer, DatasetError, OSError) as error:
         raise SystemExit(f"error: {error}") from None
     except KeyboardInterrupt:
-        raise SystemExit("stopped; the same command goes on from here") from None
+        raise SystemExit("stopped; the same command continues from here") from None
 
 
 def _chosen(set_: str | None, files: list[Path], room: str | None) -> list[Recipe]:

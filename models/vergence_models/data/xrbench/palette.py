@@ -10,7 +10,7 @@ _WOODS = ((0.42, 0.25, 0.13), (0.22, 0.11, 0.06), (0.62, 0.45, 0.28))
 _FABRICS = ("weave", "plaid", "stripes", "clouds", "speckle")
 
 
-class Palette:
+class SurfacePalette:
     """Every call draws a new surface; the same generator draws the same ones."""
 
     def __init__(self, rng: np.random.Generator) -> None:

@@ -1,4 +1,4 @@
-"""One picture of everything that is known about a frame."""
+"""A contact sheet: one picture of all images and truths of a frame."""
 
 from __future__ import annotations
 

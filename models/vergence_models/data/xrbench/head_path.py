@@ -14,7 +14,7 @@ _SWAY = 0.6
 
 
 class HeadPath:
-    """Where the left camera is at any time, before the first frame and after the last one too."""
+    """The pose of the left camera at any time, also before the first frame and after the last."""
 
     def __init__(self, recipe: Recipe, room: Room) -> None:
         # Drawn for the seed alone: the same path, at whatever speed it is walked.
