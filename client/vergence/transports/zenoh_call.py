@@ -51,9 +51,9 @@ class ZenohCall:
         stream_id: str,
         find_servers: Callable[[bool], Awaitable[ServerInfos]],
     ) -> None:
-        self.stream_id = stream_id
-        self.server_id = ""  # where the stream is open
-        self.over = False  # the server has ended the call; it was not lost
+        self.stream_id: str = stream_id
+        self.server_id: str = ""  # the server on which the stream is open
+        self.over: bool = False  # True: the server ended the call; it was not lost
         self._peer = peer
         self._namespace = namespace
         self._keys = StreamKeys(namespace, stream_id)
