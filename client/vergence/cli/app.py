@@ -12,7 +12,7 @@ from rich.console import Console
 from vergence.cli.batch import batch
 from vergence.cli.demo import bundled_sample, demo
 from vergence.cli.doctor import doctor
-from vergence.cli.errors import Trouble
+from vergence.cli.errors import CliError
 from vergence.cli.run import run
 from vergence.client import DEFAULT_SERVER, DepthClient
 from vergence_proto.errors import DepthError
@@ -40,11 +40,11 @@ def run_program() -> None:
     """Run the command line; trouble is one line on stderr and the exit code."""
     try:
         app()
-    except (Trouble, DepthError, OSError) as trouble:  # OSError: a file that cannot be written
+    except (CliError, DepthError, OSError) as error:  # OSError: a file that cannot be written
         Console(stderr=True, soft_wrap=True, highlight=False).print(
-            f"vergence: {trouble}", style="red", markup=False
+            f"vergence: {error}", style="red", markup=False
         )
-        raise SystemExit(getattr(trouble, "exit_code", 1)) from None
+        raise SystemExit(getattr(error, "exit_code", 1)) from None
 
 
 def _print_version(wanted: bool) -> None:
@@ -182,7 +182,7 @@ def _forwarding_to(entry: metadata.EntryPoint) -> Callable[[typer.Context], None
         try:
             command = entry.load()
         except ModuleNotFoundError as error:
-            raise Trouble(
+            raise CliError(
                 f"vergence {entry.name} needs {error.name}, which is not installed; "
                 "install it with: pip install 'vergence[server]'"
             ) from None

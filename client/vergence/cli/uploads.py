@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from vergence.cli.errors import Trouble
+from vergence.cli.errors import CliError
 from vergence_proto.datasets import LAYOUTS, LayoutError, find_sources
 
 _ARCHIVES = (".zip", ".tar", ".tar.gz", ".tgz", ".tar.xz", ".txz", ".tar.bz2", ".tbz2")
@@ -35,7 +35,7 @@ class Upload:
 def find_uploads(paths: list[Path]) -> list[Upload]:
     """Every sequence at ``paths``: an archive, a folder of one, or a folder of many of our own.
 
-    Raises Trouble: a path that is neither, or that holds none.
+    Raises CliError: a path that is neither, or that holds none.
     """
     taken: set[str] = set()
     return [
@@ -50,7 +50,7 @@ def _at(path: Path) -> Iterator[Upload]:
         yield Upload(path.name.partition(".")[0], path)
         return
     if not path.is_dir():
-        raise Trouble(
+        raise CliError(
             f"{path}: expected a folder, or an archive ({' '.join(_ARCHIVES)})", exit_code=2
         )
     own = _found(_OWN_LAYOUT, path)
@@ -60,10 +60,10 @@ def _at(path: Path) -> Iterator[Upload]:
         return
     others = [(kind, each) for kind in LAYOUTS for each in _found(kind, path)]
     if not others:
-        raise Trouble(f"{path}: no sequence in {', '.join(LAYOUTS)} layout", exit_code=2)
+        raise CliError(f"{path}: no sequence in {', '.join(LAYOUTS)} layout", exit_code=2)
     if len(others) > 1:
         named = ", ".join(f"{kind}:{each}" for kind, each in others[:8])
-        raise Trouble(
+        raise CliError(
             f"{path}: more than one sequence ({named}); name folders that hold one", exit_code=2
         )
     kind, folder = others[0]
@@ -74,7 +74,7 @@ def _found(kind: str, path: Path) -> list[Path]:
     try:
         specs = find_sources(f"{kind}:{path}")
     except LayoutError as error:
-        raise Trouble(str(error), exit_code=2) from None
+        raise CliError(str(error), exit_code=2) from None
     return [Path(spec.partition(":")[2]) for spec in specs]
 
 
