@@ -1,4 +1,4 @@
-"""What ``vergence batch`` sends: archives as they are, folders packed into one."""
+"""Uploads of ``vergence batch``: archives as they are, folders packed into archives."""
 
 import zipfile
 from collections.abc import Iterator
@@ -14,14 +14,14 @@ _OWN_LAYOUT = "vergence"
 
 @dataclass(frozen=True, slots=True)
 class Upload:
-    """One sequence and where it lies."""
+    """One sequence and its location."""
 
-    name: str  # of its results, unique in a batch
+    name: str  # the name of the results, unique in a batch
     path: Path  # an archive, or a folder to pack
-    source: str | None = None  # KIND:PATH in it, where the server cannot know
+    source: str | None = None  # KIND:PATH inside the archive; None: the server finds it
 
     def pack(self, scratch: Path) -> Path:
-        """The archive to send; images are compressed already, so it only gathers them."""
+        """Return the archive to send; it stores files, since images are compressed already."""
         if self.path.is_file():
             return self.path
         archive = scratch / f"{self.name}.zip"
@@ -33,9 +33,9 @@ class Upload:
 
 
 def find_uploads(paths: list[Path]) -> list[Upload]:
-    """Every sequence at ``paths``: an archive, a folder of one, or a folder of many of our own.
+    """Find the sequences at ``paths``: archives, folders of one, or of many in Vergence's layout.
 
-    Raises CliError: a path that is neither, or that holds none.
+    Raises CliError: a path is neither, or contains no sequence.
     """
     taken: set[str] = set()
     return [
