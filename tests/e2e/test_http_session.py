@@ -29,8 +29,7 @@ from vergence import (
     Superseded,
     UnknownStream,
 )
-from vergence_proto.geometry import RectifiedRig
-from vergence_proto.types import DisparityMap, StereoFrame
+from vergence_proto.types import DisparityMap, StereoFrame, StereoRig
 from vergence_service.app.server import Running, drain
 
 FRAMES = make_frames(6)
@@ -78,7 +77,8 @@ async def test_live_frames_come_back_and_the_stream_ends_with_the_session() -> N
 
 
 async def test_errors_are_those_that_the_server_raised() -> None:
-    backwards = RectifiedRig(64, 48, 60.0, 60.0, 31.5, 31.5, 23.5, -0.1)
+    straight = StereoRig.from_rectified(RIG)
+    backwards = StereoRig(straight.right, straight.left, straight.left_from_right.inverse())
     dark = make_frames(1)[0]
     dark.left[0, 0] = 254
     async with running_server(RecallModel()) as server, http_client(server) as client:

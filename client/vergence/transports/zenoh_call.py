@@ -1,4 +1,4 @@
-"""One attachment to a stream over Zenoh: a StreamDepth call made of keys."""
+"""One attachment to a stream over Zenoh: a StreamDepth call made of key expressions."""
 
 import secrets
 from collections import deque
@@ -29,19 +29,19 @@ from vergence_proto.zenoh.session import Declaration, ZenohSession, reason_of
 ServerInfos = dict[str, pb.GetServerInfoResponse]  # by server id, best first
 
 _OPEN_TIMEOUT_S = 3.0
-# A way that is open at one end only, or a server that hangs: no token tells of either.
+# A connection open at one end only, or a server that hangs: no liveliness token reports them.
 _PONG_PATIENCE_S = 5.0
-# No more maps are on the way than the server gives credit; past this the oldest would give way.
+# Above the server's credit; beyond this number the oldest map is discarded.
 _WAITING_MAPS = 16
-# The server would take the stream, had it room: another may have.
+# These refusals mean that the server has no room; another one may have.
 _NO_ROOM = (StreamLimit, StateMemory, Draining, NotReady)
 
 
 class ZenohCall:
     """A :class:`~vergence.transports.base.Call`.
 
-    What is lost on the way is found out and told as ``FramesDropped``, so that every frame is
-    answered here as it is over gRPC.
+    Frames lost on the network are detected and reported as ``FramesDropped``, so that every frame
+    is answered, as over gRPC.
     """
 
     def __init__(
@@ -51,9 +51,9 @@ class ZenohCall:
         stream_id: str,
         find_servers: Callable[[bool], Awaitable[ServerInfos]],
     ) -> None:
-        self.stream_id = stream_id
-        self.server_id = ""  # where the stream is open
-        self.over = False  # the server has ended the call; it was not lost
+        self.stream_id: str = stream_id
+        self.server_id: str = ""  # the server on which the stream is open
+        self.over: bool = False  # True: the server ended the call; it was not lost
         self._peer = peer
         self._namespace = namespace
         self._keys = StreamKeys(namespace, stream_id)
@@ -117,7 +117,7 @@ class ZenohCall:
         await self._peer.undeclare(*self._declared)
 
     def lose(self, why: str) -> None:
-        """End the call, for a session to resume it."""
+        """End the call as lost; the session resumes it."""
         self._inbox.end(ConnectionLost(why))
 
     async def _open(self, opening: pb.OpenStream) -> None:
@@ -137,7 +137,7 @@ class ZenohCall:
                 key, opening, timeout_s=_OPEN_TIMEOUT_S, attachment_id=self._attachment_id
             )
             if not answers:
-                # It may still open the stream: another must not be asked to.
+                # It may still open the stream, so no other server is asked.
                 raise ConnectionLost(f"server {self.server_id} did not answer")
             error = answers[0].error
             if error is None:
@@ -155,7 +155,7 @@ class ZenohCall:
             self.lose(f"server {self.server_id} is gone, or the way to it")
 
     async def _send_frame(self, frame: pb.Frame) -> None:
-        # Far past its limit a server's Zenoh link drops a message without a word.
+        # Far above its limit, a server's Zenoh link drops a message silently.
         if (size := frame.ByteSize()) > self._max_frame_bytes:
             error = FrameTooLarge(
                 f"expected a frame of at most {self._max_frame_bytes} bytes, got {size}"
