@@ -53,8 +53,8 @@ def serve(
     flags: dict[str, Any] = {
         "grpc.port": grpc_port,
         "http.port": http_port,
-        "grpc.host": host,
-        "http.host": host,
+        # A flag wins over the file, whichever of these the file sets.
+        **dict.fromkeys(("server.host", "grpc.host", "http.host", "zenoh.host"), host),
         "zenoh.enabled": zenoh,
         "model.name": model,
         "model.weights": weights,

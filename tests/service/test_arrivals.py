@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from tests.service.test_batcher import make_batcher, make_step
 from tests.support.models import RecallModel
 from tests.support.server import ManualClock
-from vergence_service.inference.arrivals import Due, LiveRhythm
+from vergence_service.inference.arrivals import ArrivalPredictor, ExpectedFrame
 from vergence_service.inference.batcher import StepBatcher
 from vergence_service.inference.model import Step, StepResult
 
@@ -65,7 +65,7 @@ async def test_a_step_that_would_be_in_the_way_of_a_live_frame_waits_for_it() ->
 
 
 async def test_a_free_lane_is_not_for_others_while_a_live_step_is_in_the_model() -> None:
-    model = RecallModel(lanes=2)
+    model = RecallModel(max_concurrent_steps=2)
     async with make_batcher(model) as batcher:
         with model.busy():
             urgent = asyncio.create_task(live(batcher))
@@ -79,7 +79,7 @@ async def test_a_free_lane_is_not_for_others_while_a_live_step_is_in_the_model()
 
 
 async def test_a_live_step_takes_the_free_lane_beside_another() -> None:
-    model = RecallModel(lanes=2)
+    model = RecallModel(max_concurrent_steps=2)
     async with make_batcher(model) as batcher:
         with model.busy():
             other = asyncio.create_task(batcher.step(make_step(OTHER)))
@@ -118,15 +118,17 @@ async def test_no_step_waits_for_ever() -> None:
 
 
 def test_a_rhythm_is_learned_and_forgotten() -> None:
-    rhythm = LiveRhythm()
+    rhythm = ArrivalPredictor()
     rhythm.arrived("a", 1.0)
-    assert rhythm.next_due(1.0) is None
+    assert rhythm.next_expected(1.0) is None
     rhythm.arrived("a", 1.5)
-    assert rhythm.next_due(1.5) == Due(2.0, 2.25)
+    assert rhythm.next_expected(1.5) == ExpectedFrame(2.0, 2.25)
     rhythm.arrived("b", 1.5)
     rhythm.arrived("b", 1.6)
-    assert rhythm.next_due(1.6) == Due(1.6 + (1.6 - 1.5), 1.6 + 1.5 * (1.6 - 1.5))
-    assert rhythm.next_due(1.9) == Due(2.0, 2.25), "b has stopped"
-    assert rhythm.next_due(2.3) is None, "both have"
+    assert rhythm.next_expected(1.6) == ExpectedFrame(1.6 + (1.6 - 1.5), 1.6 + 1.5 * (1.6 - 1.5))
+    assert rhythm.next_expected(1.9) == ExpectedFrame(2.0, 2.25), "b has stopped"
+    assert rhythm.next_expected(2.3) is None, "both have"
     rhythm.answered("a", 2.4)
-    assert rhythm.next_due(2.4) == Due(2.0, 2.65), "a was kept waiting and could not send"
+    assert rhythm.next_expected(2.4) == ExpectedFrame(2.0, 2.65), (
+        "a was kept waiting and could not send"
+    )

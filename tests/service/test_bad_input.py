@@ -99,7 +99,7 @@ async def test_a_bad_frame_is_answered_in_band_and_harms_nobody(
         return (await call.ask(frame_message(make_frame(frame_id)))).disparity
 
     async with (
-        running_server(RecallModel(), grpc__max_frame_mib=1) as server,
+        running_server(RecallModel(), limits__max_frame_mib=1) as server,
         raw_stream(server, "hit") as hit,
         raw_stream(server, "neighbour") as neighbour,
     ):

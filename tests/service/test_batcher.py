@@ -14,7 +14,7 @@ from tests.support.server import ManualClock
 from vergence_proto.errors import Draining, FrameStale, ModelFailed, NonFinite
 from vergence_proto.geometry import RectifiedRig
 from vergence_service.inference.batcher import StepBatcher, TimedResult
-from vergence_service.inference.model import Step, View
+from vergence_service.inference.model import Step, StereoView
 from vergence_service.metrics import Metrics
 
 
@@ -31,7 +31,7 @@ def make_batcher(
 
 def make_step(brightness: int, *, rig: RectifiedRig = RIG, iterations: int = 1) -> Step:
     frame = make_frame(1, brightness=brightness, rig=rig)
-    return Step(View(frame.left, frame.right, rig, frame.capture_ns), None, iterations)
+    return Step(StereoView(frame.left, frame.right, rig, frame.capture_ns), None, iterations)
 
 
 async def all_in_the_model(
@@ -39,7 +39,7 @@ async def all_in_the_model(
 ) -> list[asyncio.Task[TimedResult]]:
     """As many steps as the model has lanes, all of them in it; it is busy."""
     steps = []
-    for brightness in brightnesses or range(1, model.lanes + 1):
+    for brightness in brightnesses or range(1, model.max_concurrent_steps + 1):
         steps.append(asyncio.create_task(batcher.step(make_step(brightness))))
         await asyncio.to_thread(model.wait_until_entered)
     return steps
@@ -141,7 +141,7 @@ async def test_a_caller_that_gives_up_does_not_stop_the_others() -> None:
 
 @pytest.mark.parametrize("lanes", [1, 2])
 async def test_waiters_are_told_when_the_batcher_ends(lanes: int) -> None:
-    model = RecallModel(lanes=lanes)
+    model = RecallModel(max_concurrent_steps=lanes)
     with model.busy():
         async with make_batcher(model) as batcher:
             steps = [*await all_in_the_model(batcher, model)]
@@ -153,7 +153,7 @@ async def test_waiters_are_told_when_the_batcher_ends(lanes: int) -> None:
 
 
 async def test_lanes_are_filled_as_steps_arrive_and_taken_by_one_step_each() -> None:
-    model = RecallModel(lanes=2)
+    model = RecallModel(max_concurrent_steps=2)
     async with make_batcher(model, max_batch=8) as batcher:
         with model.busy():
             steps = [*await all_in_the_model(batcher, model)]
@@ -185,14 +185,16 @@ async def test_no_stream_is_overtaken_by_another(lanes: int) -> None:
             timed = await batcher.step(make_step(stream), live_stream=str(stream))
             taken.append((since_s, since_s + timed.queue_s))
 
-    async with make_batcher(RecallModel(lanes=lanes), max_batch=1, clock=clock) as batcher:
+    async with make_batcher(
+        RecallModel(max_concurrent_steps=lanes), max_batch=1, clock=clock
+    ) as batcher:
         await asyncio.gather(*map(keep_stepping, range(5)))
     assert [since_s for since_s, _ in sorted(taken, key=itemgetter(1))] == sorted(dict(taken))
 
 
 @pytest.mark.parametrize("bad", [RAISES, NOT_FINITE])
 async def test_a_failure_in_one_lane_does_not_reach_the_other(bad: int) -> None:
-    model = RecallModel(lanes=2)
+    model = RecallModel(max_concurrent_steps=2)
     async with make_batcher(model) as batcher:
         with model.busy():
             steps = await all_in_the_model(batcher, model, brightnesses=(bad, 70))

@@ -15,22 +15,22 @@ from tests.support.polling import eventually
 from tests.support.sequences import make_frames, write_sequence
 from tests.support.server import running_server
 from vergence_proto.accuracy import Accuracy
-from vergence_service.inference.model import Step, StepResult, View
+from vergence_service.inference.model import Step, StepResult, StereoView
 from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
 from vergence_service.inference.snapshots import BadSnapshot, state_from_bytes, state_to_bytes
 from vergence_service.jobs.checkpoints import read_checkpoint, write_checkpoint
 from vergence_service.jobs.job import Job, JobOptions
 from vergence_service.jobs.results import read_frames
-from vergence_service.jobs.run import Progress, run_job
+from vergence_service.jobs.run import JobProgress, run_job
 
 FRAMES = 24
 
 
-def view_of(frame_id: int, *, posed: bool = True) -> View:
+def view_of(frame_id: int, *, posed: bool = True) -> StereoView:
     frame = make_frame(frame_id, brightness=40 + frame_id)
     assert frame.pose is not None
     pose = frame.pose.world_from_left if posed else None
-    return View(frame.left, frame.right, RIG, frame.capture_ns, pose)
+    return StereoView(frame.left, frame.right, RIG, frame.capture_ns, pose)
 
 
 @pytest.fixture(scope="module")
@@ -93,15 +93,15 @@ def make_job(folder: Path, *, metrics: bool = False) -> Job:
     )
 
 
-async def run(model: RecallModel, folder: Path, job: Job) -> tuple[Progress, Accuracy | None]:
-    progress = Progress()
+async def run(model: RecallModel, folder: Path, job: Job) -> tuple[JobProgress, Accuracy | None]:
+    progress = JobProgress()
     async with running_server(model) as server:
         found = await run_job(server.engine, folder, job, progress, checkpoint_s=1e-9)
     return progress, found
 
 
 async def run_to_the_middle(folder: Path, job: Job) -> None:
-    model, progress = StopsAfter(FRAMES // 2), Progress()
+    model, progress = StopsAfter(FRAMES // 2), JobProgress()
     async with running_server(model) as server:
         work = asyncio.create_task(run_job(server.engine, folder, job, progress, checkpoint_s=1e-9))
         # Not before the model has stopped: nobody would let it go.

@@ -151,7 +151,7 @@ async def test_what_an_earlier_attachment_left_on_the_way_is_passed_over() -> No
 
 async def test_a_lossless_client_that_breaks_its_credit_is_ended() -> None:
     model = RecallModel()
-    async with served(model, grpc__credit=2, grpc__waiting_frames=1) as client:
+    async with served(model, streams__credit=2, streams__waiting_frames=1) as client:
         await client.open(every=True)
         with model.busy():
             for frame_id in range(1, 41):

@@ -32,8 +32,8 @@ class RecallModel:
         weights_sha256="0" * 64,
     )
 
-    def __init__(self, *, lanes: int = 1) -> None:
-        self.lanes = lanes
+    def __init__(self, *, max_concurrent_steps: int = 1) -> None:
+        self.max_concurrent_steps = max_concurrent_steps
         self.batches: list[int] = []
         self._free = threading.Event()
         self._free.set()

@@ -30,7 +30,7 @@ _MIB = 1 << 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HttpFace:
+class HttpTransport:
     server: HttpServer
     start_jobs: Callable[[], None]  # once the model is there
 
@@ -38,11 +38,12 @@ class HttpFace:
 @asynccontextmanager
 async def serving_http(
     settings: Settings,
+    host: str,
     engine: DepthEngine,
     unary: UnaryMethods,
     calls: OpenCalls,
     registry: CollectorRegistry,
-) -> AsyncIterator[HttpFace]:
+) -> AsyncIterator[HttpTransport]:
     """Listen and answer, to the end of the block. Raises PortTaken."""
     batch = settings.batch
     archive = ArchiveLimits(
@@ -54,7 +55,7 @@ async def serving_http(
         max_bytes=batch.max_upload_mib * _MIB, idle_s=batch.idle_s, archive=archive
     )
     pair = UploadLimits(
-        max_bytes=2 * settings.grpc.max_frame_mib * _MIB,
+        max_bytes=2 * settings.limits.max_frame_mib * _MIB,
         idle_s=batch.idle_s,
         archive=replace(archive, max_files=2),
     )
@@ -94,11 +95,9 @@ async def serving_http(
             routes=routes,
         )
         server = await stack.enter_async_context(
-            HttpServer(
-                app, calls, host=settings.http.host, port=settings.http.port, stopping=stopping
-            )
+            HttpServer(app, calls, host=host, port=settings.http.port, stopping=stopping)
         )
-        yield HttpFace(server, start)
+        yield HttpTransport(server, start)
 
 
 def _nothing() -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from vergence_service.settings import Settings
-from vergence_service.transports.addresses import place
+from vergence_service.transports.addresses import format_address
 from vergence_service.transports.errors import ExtraMissing
 from vergence_service.transports.open_calls import OpenCalls
 from vergence_service.transports.unary import UnaryMethods
@@ -18,15 +18,15 @@ _ROUTER_PORT = 7447  # by custom
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ZenohFace:
+class ZenohTransport:
     server: "ZenohServer"
     endpoint: str  # where clients find it, or the file that says so
 
 
 @asynccontextmanager
-async def on_zenoh(
+async def serving_zenoh(
     settings: Settings, unary: UnaryMethods, calls: OpenCalls
-) -> AsyncIterator[ZenohFace | None]:
+) -> AsyncIterator[ZenohTransport | None]:
     """On the network to the end of the block. Raises ExtraMissing, ZenohUnreachable."""
     chosen = settings.zenoh
     if not chosen.enabled:
@@ -38,7 +38,8 @@ async def on_zenoh(
         raise ExtraMissing("Zenoh", "zenoh") from None
     listen = list(chosen.listen)
     if chosen.mode == "router" and not listen:
-        listen = [f"tcp/{place(settings.grpc.host, _ROUTER_PORT)}"]
+        host = chosen.host or settings.server.host
+        listen = [f"tcp/{format_address(host, _ROUTER_PORT)}"]
     config = zenoh_config(
         chosen.config,
         mode=chosen.mode,
@@ -48,4 +49,4 @@ async def on_zenoh(
     )
     endpoint = str(chosen.config or ",".join(listen or chosen.connect))
     async with ZenohServer(unary, calls, config=config, namespace=chosen.namespace) as server:
-        yield ZenohFace(server, endpoint)
+        yield ZenohTransport(server, endpoint)

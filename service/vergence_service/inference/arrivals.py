@@ -11,31 +11,31 @@ _SMOOTHING = 0.2
 
 
 @dataclass(slots=True)
-class _Beat:
+class _Cadence:
     last_s: float  # when its last frame came
     answered_s: float  # when that was answered; until then no other can come
     interval_s: float | None = None  # None: only one frame has come
 
 
 @dataclass(frozen=True, slots=True)
-class Due:
+class ExpectedFrame:
     """A live frame that is expected."""
 
     at_s: float
     until_s: float  # after which it is not waited for
 
 
-class LiveRhythm:
+class ArrivalPredictor:
     """Learns from the arrivals of live steps when the next ones come, stream by stream."""
 
     def __init__(self) -> None:
-        self._beats: dict[str, _Beat] = {}
+        self._beats: dict[str, _Cadence] = {}
 
     def arrived(self, stream_id: str, now_s: float) -> None:
         beat = self._beats.get(stream_id)
         interval_s = 0.0 if beat is None else now_s - beat.last_s
         if beat is None or interval_s > _LONGEST_S:
-            self._beats[stream_id] = _Beat(now_s, now_s)
+            self._beats[stream_id] = _Cadence(now_s, now_s)
             return
         known_s = beat.interval_s or interval_s
         beat.interval_s = known_s + _SMOOTHING * (interval_s - known_s)
@@ -45,9 +45,9 @@ class LiveRhythm:
         if stream_id in self._beats:
             self._beats[stream_id].answered_s = now_s
 
-    def next_due(self, now_s: float) -> Due | None:
+    def next_expected(self, now_s: float) -> ExpectedFrame | None:
         """The live frame that is expected first; None if none is, or none has a rhythm."""
-        found: Due | None = None
+        found: ExpectedFrame | None = None
         for stream_id, beat in list(self._beats.items()):
             if now_s - beat.last_s > _LONGEST_S * (1 + _LATE):
                 del self._beats[stream_id]
@@ -55,5 +55,5 @@ class LiveRhythm:
                 at_s = beat.last_s + beat.interval_s
                 until_s = max(at_s, beat.answered_s) + _LATE * beat.interval_s
                 if now_s < until_s and (found is None or at_s < found.at_s):
-                    found = Due(at_s, until_s)
+                    found = ExpectedFrame(at_s, until_s)
         return found

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Self
 
 from vergence_proto.errors import DepthError, Draining, FrameStale, ModelFailed
-from vergence_service.inference.arrivals import LiveRhythm
+from vergence_service.inference.arrivals import ArrivalPredictor
 from vergence_service.inference.model import Step, StepResult, StereoModel
 from vergence_service.metrics import Metrics
 
@@ -70,18 +70,20 @@ class StepBatcher:
     ) -> None:
         self._model = model
         # The first row of a batch would wait for the last while another lane stands empty.
-        self._max_batch = max_batch if model.lanes == 1 else 1
+        self._max_batch = max_batch if model.max_concurrent_steps == 1 else 1
         self._clock = clock
         self._metrics = metrics
         self._waiting: list[_Waiting] = []
         self._in_model: list[_Waiting] = []
-        self._free_lanes = asyncio.Semaphore(model.lanes)
+        self._free_lanes = asyncio.Semaphore(model.max_concurrent_steps)
         self._changed = asyncio.Event()  # a step arrived, or left the model
-        self._rhythm = LiveRhythm()
+        self._arrivals = ArrivalPredictor()
         self._work_s: dict[tuple[object, ...], float] = {}  # how long each shape of work took
 
     async def __aenter__(self) -> Self:
-        self._threads = ThreadPoolExecutor(self._model.lanes, thread_name_prefix="model")
+        self._threads = ThreadPoolExecutor(
+            self._model.max_concurrent_steps, thread_name_prefix="model"
+        )
         self._worker = asyncio.create_task(self._run(), name="step-batcher")
         return self
 
@@ -108,7 +110,7 @@ class StepBatcher:
         answer: asyncio.Future[TimedResult] = asyncio.get_running_loop().create_future()
         self._waiting.append(_Waiting(step, now_s, deadline_s, live_stream, answer))
         if live_stream is not None:
-            self._rhythm.arrived(live_stream, now_s)
+            self._arrivals.arrived(live_stream, now_s)
         self._changed.set()
         return await answer
 
@@ -147,7 +149,7 @@ class StepBatcher:
             return 0.0
         if any(item.live for item in self._in_model):
             return patience_s
-        if (due := self._rhythm.next_due(now_s)) is None:
+        if (due := self._arrivals.next_expected(now_s)) is None:
             return 0.0
         # What was never seen is taken to be as long as the longest that was.
         longest_s = max(self._work_s.values(), default=0.0)
@@ -190,7 +192,7 @@ class StepBatcher:
         self._metrics.batch_size.observe(len(batch))
         for item, result in zip(batch, results, strict=True):
             if item.live_stream is not None:
-                self._rhythm.answered(item.live_stream, started_s + model_s)
+                self._arrivals.answered(item.live_stream, started_s + model_s)
             if not item.answer.done():
                 queue_s = started_s - item.since_s
                 item.answer.set_result(TimedResult(result, queue_s, model_s))

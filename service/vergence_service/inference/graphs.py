@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from onnxruntime import InferenceSession, SessionOptions
 
 from vergence_proto.model_io import DISPARITY, SIGMA, ManifestError, ModelCard, Stages
-from vergence_service.inference.providers import Resident, Tensor, run_on_device, start_session
+from vergence_service.inference.providers import DeviceTensor, Tensor, run_on_device, start_session
 
 log = logging.getLogger(__name__)
 
-Tensors = Mapping[str, NDArray[np.generic] | Resident]
+Tensors = Mapping[str, NDArray[np.generic] | DeviceTensor]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +55,7 @@ class _Part:
         return dict(zip(names, [*host, *stayed], strict=True))
 
 
-class StagedGraphs:
+class GraphRunner:
     """The graphs of a model, each loaded once.
 
     ``providers`` are onnxruntime's names. Steps use ``threads`` threads, 0 for one a core. As many
@@ -80,20 +80,20 @@ class StagedGraphs:
         self._sessions: dict[Path, InferenceSession] = {}
         self._steps: dict[Stages, list[list[_Part]]] = {}
         width = max(map(len, card.all_stages))
-        self.lanes = min(threads or _cores(), width)
+        self.max_concurrent_steps = min(threads or _cores(), width)
         # A model that is cut for several threads leaves each of them its own graph, also in stages
         # of one: two threads that shared the last graph of `lite`, operator by operator, took 15 %
         # less time but a fifth more work, while another stream's step can use the second thread
         # whole. Alone: onnxruntime knows best what "one a core" is.
         self._operator_threads = max(1, (threads or _cores()) // width) if width > 1 else threads
-        self._beside = ThreadPoolExecutor(self.lanes, thread_name_prefix="graph")
+        self._side_pool = ThreadPoolExecutor(self.max_concurrent_steps, thread_name_prefix="graph")
         self._running = 0
         self._counting = threading.Lock()
         self._loading = threading.Lock()
 
     def close(self) -> None:
         """End the threads; no step may follow."""
-        self._beside.shutdown()
+        self._side_pool.shutdown()
 
     def load(self, iterations: int, *, cold_pixels: int | None = None) -> list[list[_Part]]:
         """The graphs of a step, from now on in memory.
@@ -138,12 +138,12 @@ class StagedGraphs:
                 self._running -= 1
 
     def _run_stage(self, parts: Sequence[_Part], tensors: Tensors) -> list[dict[str, Tensor]]:
-        if self.lanes == 1 or self._running > 1:
+        if self.max_concurrent_steps == 1 or self._running > 1:
             return [part.run(tensors, self._device) for part in parts]
         first, *others = parts  # the caller's thread takes a graph as well
         futures: list[Future[dict[str, Tensor]]] = []
         try:
-            futures += (self._beside.submit(part.run, tensors, self._device) for part in others)
+            futures += (self._side_pool.submit(part.run, tensors, self._device) for part in others)
             outputs = first.run(tensors, self._device)
         finally:
             wait(futures)  # also where one fails: no graph runs on into the next step

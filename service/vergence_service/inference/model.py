@@ -22,7 +22,7 @@ _NO_MOTION = np.eye(4, dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class StereoView:
     """What one step looks at: a rectified pair and where its left camera was."""
 
     left: Image
@@ -47,7 +47,7 @@ class RecurrentState:
 
     @classmethod
     def after(
-        cls, view: View, previous: "RecurrentState | None", tensors: tuple[Tensor, ...]
+        cls, view: StereoView, previous: "RecurrentState | None", tensors: tuple[Tensor, ...]
     ) -> "RecurrentState":
         return cls(
             tensors=tensors,
@@ -67,7 +67,7 @@ class RecurrentState:
 class Step:
     """One row of a batch. A state is only given where it and the view have a pose."""
 
-    view: View
+    view: StereoView
     state: RecurrentState | None  # None: a cold start
     iterations: int  # one of the model card's
 
@@ -117,7 +117,7 @@ class StereoModel(Protocol):
         ...
 
     @property
-    def lanes(self) -> int:
+    def max_concurrent_steps(self) -> int:
         """How many threads may call ``step`` at once; above 1, a batch of several gains nothing."""
         ...
 

@@ -18,11 +18,11 @@ from vergence_proto.model_io import (
     ModelCard,
     load_model_card,
 )
-from vergence_service.inference.graphs import StagedGraphs
+from vergence_service.inference.graphs import GraphRunner
 from vergence_service.inference.model import RecurrentState, Step, StepResult
 from vergence_service.inference.providers import (
     ENGINE,
-    Resident,
+    DeviceTensor,
     Tensor,
     device_of,
     require_provider,
@@ -50,7 +50,7 @@ class OnnxStereoModel:
         self._card = load_model_card(weights_dir, name)
         self._provider = require_provider(providers[0])
         self._device = states_on or device_of(providers[0])
-        self._graphs = StagedGraphs(
+        self._graphs = GraphRunner(
             self._card,
             providers=[require_provider(provider) for provider in providers],
             threads=threads,
@@ -71,8 +71,8 @@ class OnnxStereoModel:
         return ENGINE
 
     @property
-    def lanes(self) -> int:
-        return self._graphs.lanes if self._device is None else 1
+    def max_concurrent_steps(self) -> int:
+        return self._graphs.max_concurrent_steps if self._device is None else 1
 
     def warm_up(self, iterations: int, *cold_iterations: int) -> None:
         self._graphs.load(iterations)
@@ -95,7 +95,7 @@ class OnnxStereoModel:
         pixels = math.prod(self._card.step_size(height, width)) if steps[0].cold else None
         found = self._graphs.run(steps[0].iterations, self._feeds(steps), cold_pixels=pixels)
         # What is not finite in a state that stays shows in the maps of the next step.
-        to_check = [values for values in found.values() if not isinstance(values, Resident)]
+        to_check = [values for values in found.values() if not isinstance(values, DeviceTensor)]
         if not all(np.isfinite(values).all() for values in to_check):
             raise NonFinite("the network's result was not finite; the stream starts anew")
         disparity, sigma = _batch_on_host(found[DISPARITY]), _batch_on_host(found[SIGMA])
@@ -109,9 +109,9 @@ class OnnxStereoModel:
             for row, step in enumerate(steps)
         ]
 
-    def _feeds(self, steps: Sequence[Step]) -> dict[str, NDArray[np.generic] | Resident]:
+    def _feeds(self, steps: Sequence[Step]) -> dict[str, NDArray[np.generic] | DeviceTensor]:
         left = _stack([self._card.grown(step.view.left) for step in steps])
-        feeds: dict[str, NDArray[np.generic] | Resident] = {
+        feeds: dict[str, NDArray[np.generic] | DeviceTensor] = {
             LEFT: left,
             RIGHT: _stack([self._card.grown(step.view.right) for step in steps]),
             UVD_CURR_FROM_PREV: _stack([step.uvd_curr_from_prev for step in steps]),
@@ -121,7 +121,7 @@ class OnnxStereoModel:
             before = [step.state.tensors[index] if step.state else nothing for step in steps]
             feeds[tensor.input_name] = (
                 before[0]
-                if len(before) == 1 and isinstance(before[0], Resident)
+                if len(before) == 1 and isinstance(before[0], DeviceTensor)
                 else _stack([*map(on_host, before)])
             )
         return feeds
@@ -129,16 +129,16 @@ class OnnxStereoModel:
 
 def on_host(tensor: Tensor) -> NDArray[np.float32]:
     """[C, h, w], wherever it was."""
-    return tensor.on_host()[0] if isinstance(tensor, Resident) else tensor
+    return tensor.on_host()[0] if isinstance(tensor, DeviceTensor) else tensor
 
 
 def _batch_on_host(tensor: Tensor) -> NDArray[np.float32]:
-    return tensor.on_host() if isinstance(tensor, Resident) else tensor
+    return tensor.on_host() if isinstance(tensor, DeviceTensor) else tensor
 
 
 def _rows(tensors: Sequence[Tensor], count: int) -> list[tuple[Tensor, ...]]:
     """The states of the rows of a batch. A lone one stays where it is, several go to the host."""
-    if count == 1 and isinstance(tensors[0], Resident):
+    if count == 1 and isinstance(tensors[0], DeviceTensor):
         return [tuple(tensors)]
     batches = [*map(_batch_on_host, tensors)]
     return [tuple(batch[row] for batch in batches) for row in range(count)]

@@ -32,7 +32,7 @@ class ProviderUnavailable(RuntimeError):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Resident:
+class DeviceTensor:
     """A tensor that stays on its device; one of a state is float32."""
 
     value: onnxruntime.OrtValue
@@ -46,7 +46,7 @@ class Resident:
         return copy
 
 
-Tensor = NDArray[np.float32] | Resident
+Tensor = NDArray[np.float32] | DeviceTensor
 
 
 def require_provider(name: str) -> str:
@@ -83,19 +83,19 @@ def start_session(
 
 def run_on_device(
     session: onnxruntime.InferenceSession,
-    feeds: Mapping[str, NDArray[np.generic] | Resident],
+    feeds: Mapping[str, NDArray[np.generic] | DeviceTensor],
     *,
     to_host: Sequence[str],
     to_stay: Sequence[str],
     device: str,
-) -> tuple[list[NDArray[np.float32]], list[Resident]]:
+) -> tuple[list[NDArray[np.float32]], list[DeviceTensor]]:
     """Run a graph once: outputs copied to the host, and outputs that stay on ``device``.
 
     What stayed is fed to the next run as it is, without a copy.
     """
     binding = session.io_binding()
     for name, value in feeds.items():
-        if isinstance(value, Resident):
+        if isinstance(value, DeviceTensor):
             binding.bind_ortvalue_input(name, value.value)
         else:
             binding.bind_cpu_input(name, np.ascontiguousarray(value))
@@ -108,4 +108,4 @@ def run_on_device(
     binding.synchronize_outputs()
     outputs = binding.get_outputs()
     host = [value.numpy() for value in outputs[: len(to_host)]]
-    return host, [Resident(value) for value in outputs[len(to_host) :]]
+    return host, [DeviceTensor(value) for value in outputs[len(to_host) :]]

@@ -71,7 +71,7 @@ def unpack(archive: Path, folder: Path, limits: ArchiveLimits) -> None:
     try:
         for member in members(archive, start):
             budget.take_file(member)
-            _write(member, _place(folder, member.name), budget)
+            _write(member, _target_path(folder, member.name), budget)
     except _DAMAGED as error:
         raise BadSequence(f"expected a whole zip or tar archive: {error}") from None
 
@@ -104,7 +104,7 @@ class _Budget:
             )
 
 
-def _place(folder: Path, name: str) -> Path:
+def _target_path(folder: Path, name: str) -> Path:
     """Where a member goes. Raises BadSequence: not below ``folder``."""
     path = PurePosixPath(name)
     parts = [part for part in path.parts if part != "."]

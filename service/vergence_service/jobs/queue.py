@@ -17,9 +17,9 @@ from vergence_proto.errors import (
 )
 from vergence_proto.jobs import JobState
 from vergence_service.jobs.job import Job, JobOptions
-from vergence_service.jobs.registry import JobShelf
+from vergence_service.jobs.registry import JobRegistry
 from vergence_service.jobs.results import result_bytes
-from vergence_service.jobs.run import opening_of
+from vergence_service.jobs.run import job_stream_config
 from vergence_service.jobs.sources import find_sequence, open_below
 from vergence_service.jobs.store import JobStore, folder_bytes, remove_folder
 from vergence_service.jobs.upload_checks import check_folder
@@ -58,12 +58,12 @@ class JobQueue:
         self._engine = engine
         self._store = store
         self._limits = limits
-        self._shelf = JobShelf(store, keep_s=limits.keep_s, disk_bytes=limits.disk_bytes)
-        self._worker = JobWorker(engine, self._shelf, checkpoint_s=limits.checkpoint_s)
+        self._registry = JobRegistry(store, keep_s=limits.keep_s, disk_bytes=limits.disk_bytes)
+        self._worker = JobWorker(engine, self._registry, checkpoint_s=limits.checkpoint_s)
         self._uploads: list[str] = []  # whose they are
 
     async def __aenter__(self) -> Self:
-        await self._shelf.load()
+        await self._registry.load()
         return self
 
     async def __aexit__(self, *exc_info: object) -> None:
@@ -74,7 +74,7 @@ class JobQueue:
         self._worker.start()
 
     @asynccontextmanager
-    async def place(self, client: str) -> AsyncIterator[Path]:
+    async def reserve_slot(self, client: str) -> AsyncIterator[Path]:
         """A place in the queue, and a folder to receive an upload in, removed if not accepted.
 
         ``client`` is the address that it comes from. Raises QueueFull, Quota.
@@ -92,7 +92,7 @@ class JobQueue:
 
     def _check_room(self, client: str) -> None:
         limits = self._limits
-        waiting = [*(job.client for job in self._shelf.unfinished()), *self._uploads]
+        waiting = [*(job.client for job in self._registry.unfinished()), *self._uploads]
         if len(waiting) >= limits.waiting:
             raise QueueFull(
                 f"{limits.waiting} sequences are waiting, as many as may; try again later",
@@ -112,11 +112,11 @@ class JobQueue:
         """Take the sequence below ``folder``/input; from the return on it will not be lost.
 
         ``wanted`` is KIND:PATH, and needed where there are several. Raises BadSequence, QueueFull,
-        UploadTooLarge, FrameTooLarge, and what DepthEngine.open_apart raises.
+        UploadTooLarge, FrameTooLarge, and what DepthEngine.open_offline raises.
         """
         limit = self._engine.max_pixels
         spec, source = await asyncio.to_thread(_find, folder / "input", wanted, max_pixels=limit)
-        await self._engine.open_apart(opening_of(source, options))  # for its refusals
+        await self._engine.open_offline(job_stream_config(source, options))  # for its refusals
         uploaded = await asyncio.to_thread(folder_bytes, folder)
         job = Job(
             job_id=secrets.token_hex(8),
@@ -128,17 +128,17 @@ class JobQueue:
             options=options,
             disk_bytes=uploaded + result_bytes(source, options.outputs),
         )
-        await self._shelf.make_room(job.disk_bytes, retry_after_s=self._worker.usual_job_s())
-        await self._shelf.accept(folder, job)
+        await self._registry.make_room(job.disk_bytes, retry_after_s=self._worker.usual_job_s())
+        await self._registry.accept(folder, job)
         return self.status(job.job_id)
 
     def status(self, job_id: str) -> JobStatus:
         """Raises UnknownSequence."""
-        job = self._shelf.get(job_id)
+        job = self._registry.get(job_id)
         progress = self._worker.progress(job_id)
         if job.ended or progress is None:
             done = job.frames if job.state is JobState.DONE else 0
-            ahead = 0 if job.ended else self._shelf.unfinished().index(job)
+            ahead = 0 if job.ended else self._registry.unfinished().index(job)
             return JobStatus(job, done, ahead, job.fps, None)
         return JobStatus(
             job, progress.frames_done, 0, progress.fps or None, progress.eta_s(job.frames)
@@ -146,35 +146,35 @@ class JobQueue:
 
     def statuses(self) -> list[JobStatus]:
         """Of all jobs, oldest first."""
-        return [self.status(job.job_id) for job in self._shelf]
+        return [self.status(job.job_id) for job in self._registry]
 
     async def change(self, *, within_s: float) -> None:
         """Wait until a job begins, ends or is deleted, but not for longer than ``within_s``."""
-        await self._shelf.change(within_s=within_s)
+        await self._registry.change(within_s=within_s)
 
     async def delete(self, job_id: str) -> None:
         """Stop the job if it has not ended, and remove all that it has. Raises UnknownSequence."""
-        self._shelf.forget(job_id)
+        self._registry.forget(job_id)
         await self._worker.cancel(job_id)
-        await self._shelf.remove(job_id)
+        await self._registry.remove(job_id)
 
     def result(self, job_id: str) -> tuple[Job, Path]:
         """A job that is done, and the folder of its result.
 
         Raises UnknownSequence, SequenceNotDone.
         """
-        job = self._shelf.get(job_id)
+        job = self._registry.get(job_id)
         if job.state is not JobState.DONE:
             failure = f": {job.reason}: {job.message}" if job.state is JobState.FAILED else ""
             raise SequenceNotDone(
                 f"sequence {job_id} has no result, it is {job.state}{failure}",
                 retry_after_s=None if job.ended else self._worker.usual_job_s(),
             )
-        return job, self._shelf.folder(job_id) / "result"
+        return job, self._registry.folder(job_id) / "result"
 
     def reading(self, job_id: str) -> AbstractContextManager[None]:
         """The job's result does not expire before the block ends."""
-        return self._shelf.reading(job_id)
+        return self._registry.reading(job_id)
 
 
 def _find(folder: Path, wanted: str | None, *, max_pixels: int) -> tuple[str, StereoSource]:

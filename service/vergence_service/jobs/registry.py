@@ -14,7 +14,7 @@ from vergence_service.jobs.job import Job
 from vergence_service.jobs.store import JobStore, folder_bytes
 
 
-class JobShelf:
+class JobRegistry:
     """The jobs of a store in memory, oldest first, and word of their changes.
 
     All methods belong to the event loop; files and the database are touched in threads.
@@ -76,7 +76,7 @@ class JobShelf:
             self._jobs[job.job_id] = job
             await self._tell()
 
-    async def put_away(self, job: Job) -> None:
+    async def finish(self, job: Job) -> None:
         """The job has ended."""
         result = self._store.folder(job.job_id) / "result"
         done = job.state is JobState.DONE

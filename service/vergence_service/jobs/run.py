@@ -17,7 +17,7 @@ from vergence_service.jobs.results import holds_frames, start_result, write_fram
 from vergence_service.jobs.sources import open_below, sequence_error, without_truth
 from vergence_service.jobs.stepping import Stepped, step_all
 from vergence_service.streams.engine import DepthEngine
-from vergence_service.streams.stream import Opening
+from vergence_service.streams.stream import StreamConfig
 
 # Frames that are being written while the next ones are stepped.
 _UNWRITTEN = 2
@@ -25,7 +25,7 @@ _CHECKPOINT = "checkpoint"
 
 
 @dataclass(slots=True, eq=False)
-class Progress:
+class JobProgress:
     """How far a run is."""
 
     since_s: float = field(default_factory=time.monotonic)
@@ -42,12 +42,12 @@ class Progress:
         return (frames - self.frames_done) / self.fps if self.fps else None
 
 
-def opening_of(source: StereoSource, options: JobOptions) -> Opening:
+def job_stream_config(source: StereoSource, options: JobOptions) -> StreamConfig:
     """How a sequence is stepped; lossless, so it gives way to live streams.
 
     The iterations of a lone pair are those of its cold start, as in ``vergence run``.
     """
-    return Opening(
+    return StreamConfig(
         source.rig,
         delivery=Delivery.EVERY,
         output=OutputFormat(confidence=Output.CONFIDENCE in options.outputs),
@@ -57,7 +57,7 @@ def opening_of(source: StereoSource, options: JobOptions) -> Opening:
 
 
 async def run_job(
-    engine: DepthEngine, folder: Path, job: Job, progress: Progress, *, checkpoint_s: float
+    engine: DepthEngine, folder: Path, job: Job, progress: JobProgress, *, checkpoint_s: float
 ) -> Accuracy | None:
     """Fill ``folder``/result from ``folder``/input, from where an earlier run has left it.
 
@@ -90,7 +90,9 @@ async def run_job(
             await asyncio.to_thread(write_checkpoint, folder / _CHECKPOINT, checkpoint)
             checkpoint_due_s = time.monotonic() + checkpoint_s
 
-    steps = step_all(engine, source, opening_of(source, job.options), start=start, state=state)
+    steps = step_all(
+        engine, source, job_stream_config(source, job.options), start=start, state=state
+    )
     try:
         async with aclosing(steps):
             async for stepped in steps:

@@ -13,7 +13,7 @@ from vergence_proto.datasets import (
 from vergence_proto.types import DisparityMap
 from vergence_service.inference.model import RecurrentState
 from vergence_service.streams.engine import DepthEngine
-from vergence_service.streams.stream import Opening, Stream
+from vergence_service.streams.stream import Stream, StreamConfig
 
 # One step is in the model while the answer of the one before is made ready.
 _IN_FLIGHT = 2
@@ -32,7 +32,7 @@ class Stepped:
 async def step_all(
     engine: DepthEngine,
     source: StereoSource,
-    opening: Opening,
+    config: StreamConfig,
     *,
     start: int = 0,
     state: RecurrentState | None = None,
@@ -41,9 +41,9 @@ async def step_all(
 
     Or every one from ``start`` on, whose predecessor left ``state``.
 
-    Raises what DepthEngine.open_apart and step_apart raise; LayoutError: a file cannot be read.
+    Raises what DepthEngine.open_offline and step_offline raise; LayoutError: a file cannot be read.
     """
-    stream = await engine.open_apart(opening, state=state)
+    stream = await engine.open_offline(config, state=state)
     frames = read_ahead(source, start=start)
     waiting: deque[asyncio.Task[Stepped]] = deque()
     try:
@@ -60,5 +60,5 @@ async def step_all(
 
 
 async def _step(engine: DepthEngine, stream: Stream, index: int, source: SourceFrame) -> Stepped:
-    disparity, state = await engine.step_apart(stream, lambda: source.frame)
+    disparity, state = await engine.step_offline(stream, lambda: source.frame)
     return Stepped(index, source, disparity, state)

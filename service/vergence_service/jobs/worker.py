@@ -9,8 +9,8 @@ from functools import partial
 from vergence_proto.errors import DepthError, Draining, ModelFailed, NotReady
 from vergence_proto.jobs import JobState
 from vergence_service.jobs.job import Job
-from vergence_service.jobs.registry import JobShelf
-from vergence_service.jobs.run import Progress, run_job
+from vergence_service.jobs.registry import JobRegistry
+from vergence_service.jobs.run import JobProgress, run_job
 from vergence_service.streams.engine import DepthEngine
 
 log = logging.getLogger(__name__)
@@ -26,26 +26,26 @@ _USUAL_JOB_S = 2.0
 
 @dataclass(slots=True, eq=False)
 class _Running:
-    progress: Progress = field(default_factory=Progress)
+    progress: JobProgress = field(default_factory=JobProgress)
     task: asyncio.Task[None] | None = None
     stepped: asyncio.Event = field(default_factory=asyncio.Event)  # the model is free again
 
 
 class JobWorker:
-    """Steps one job of the shelf at a time, so that a sequence is done as early as it can be."""
+    """Steps one job of the registry at a time, so that a sequence is done as early as it can be."""
 
-    def __init__(self, engine: DepthEngine, shelf: JobShelf, *, checkpoint_s: float) -> None:
+    def __init__(self, engine: DepthEngine, registry: JobRegistry, *, checkpoint_s: float) -> None:
         self._engine = engine
-        self._shelf = shelf
+        self._registry = registry
         self._checkpoint_s = checkpoint_s
         self._running: dict[str, _Running] = {}  # at most one is stepped, one is being put away
         self._leaving = False  # the server is shutting down
         self._last_job_s = _USUAL_JOB_S
         self._tasks: list[asyncio.Task[None]] = []
         self._metrics = engine.metrics
-        self._metrics.sequence_disk_bytes.set_function(shelf.taken_bytes)
+        self._metrics.sequence_disk_bytes.set_function(registry.taken_bytes)
         for state in (JobState.QUEUED, JobState.RUNNING):
-            self._metrics.sequences.labels(state).set_function(partial(shelf.count, state))
+            self._metrics.sequences.labels(state).set_function(partial(registry.count, state))
 
     def start(self) -> None:
         """Run what waits, that of earlier servers first, until :meth:`stop`."""
@@ -59,7 +59,7 @@ class JobWorker:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
-    def progress(self, job_id: str) -> Progress | None:
+    def progress(self, job_id: str) -> JobProgress | None:
         """How far a job is; None if it does not run."""
         running = self._running.get(job_id)
         return None if running is None else running.progress
@@ -74,9 +74,9 @@ class JobWorker:
     def usual_job_s(self) -> float:
         """How long until a place is free, as far as anybody can tell."""
         etas_s = [
-            running.progress.eta_s(self._shelf.get(job_id).frames)
+            running.progress.eta_s(self._registry.get(job_id).frames)
             for job_id, running in self._running.items()
-            if job_id in self._shelf
+            if job_id in self._registry
         ]
         return max((eta_s for eta_s in etas_s if eta_s is not None), default=self._last_job_s)
 
@@ -84,10 +84,10 @@ class JobWorker:
         async with asyncio.TaskGroup() as tasks:
             before: asyncio.Task[None] | None = None
             while not self._leaving:
-                waiting = self._shelf.unfinished()
+                waiting = self._registry.unfinished()
                 job = next((each for each in waiting if each.job_id not in self._running), None)
                 if job is None:
-                    await self._shelf.change(within_s=_EXPIRE_EVERY_S)
+                    await self._registry.change(within_s=_EXPIRE_EVERY_S)
                     continue
                 running = self._running[job.job_id] = _Running()
                 name = f"sequence {job.job_id}"
@@ -107,7 +107,7 @@ class JobWorker:
                 running.stepped.set()
             # Before anybody can hear of the end in another way.
             self._count_ended(ended, running.progress)
-            await self._shelf.put_away(ended)
+            await self._registry.finish(ended)
         except (Draining, NotReady):
             self._leaving = True
         except Exception:  # a full disk, most likely: the job keeps its place
@@ -123,10 +123,10 @@ class JobWorker:
                 job, ModelFailed(f"the server died {job.attempts} times while it ran this sequence")
             )
         started = replace(job, state=JobState.RUNNING, attempts=job.attempts + 1)
-        await self._shelf.update(started)
+        await self._registry.update(started)
 
         try:
-            folder = self._shelf.folder(job.job_id)
+            folder = self._registry.folder(job.job_id)
             found = await run_job(
                 self._engine,
                 folder,
@@ -136,7 +136,7 @@ class JobWorker:
             )
         except (Draining, NotReady, asyncio.CancelledError):
             # Not the sequence's doing: it keeps its place, for this server or the next one.
-            await self._shelf.update(replace(job, state=JobState.QUEUED))
+            await self._registry.update(replace(job, state=JobState.QUEUED))
             raise
         except DepthError as error:
             return _failed(started, error)
@@ -148,7 +148,7 @@ class JobWorker:
             started, state=JobState.DONE, fps=running.progress.fps or None, accuracy=accuracy
         )
 
-    def _count_ended(self, job: Job, progress: Progress) -> None:
+    def _count_ended(self, job: Job, progress: JobProgress) -> None:
         if job.state is JobState.DONE:
             self._metrics.sequences_done.inc()
             self._metrics.sequence_s.observe(time.monotonic() - progress.since_s)
@@ -157,7 +157,7 @@ class JobWorker:
 
     async def _expire_now_and_then(self) -> None:
         while True:
-            await self._shelf.expire()
+            await self._registry.expire()
             await asyncio.sleep(_EXPIRE_EVERY_S)
 
 

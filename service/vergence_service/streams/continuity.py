@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vergence_proto.types import Origin
-from vergence_service.inference.model import RecurrentState, View
+from vergence_service.inference.model import RecurrentState, StereoView
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -17,7 +17,9 @@ class ContinuityLimits:
     max_jump_deg: float
 
 
-def break_between(state: RecurrentState, view: View, limits: ContinuityLimits) -> Origin | None:
+def break_between(
+    state: RecurrentState, view: StereoView, limits: ContinuityLimits
+) -> Origin | None:
     """The reason why ``view`` cannot continue ``state``, or None if it can."""
     if view.world_from_left is None or state.world_from_left is None:
         return Origin.RESET_POSE_LOST

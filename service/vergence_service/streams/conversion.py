@@ -9,12 +9,12 @@ from vergence_proto.errors import BadShape
 from vergence_proto.geometry import Axes, Pose
 from vergence_proto.types import DisparityMap, Origin, Plane, StereoFrame, Timings
 from vergence_service.inference.batcher import TimedResult
-from vergence_service.inference.model import View
+from vergence_service.inference.model import StereoView
 from vergence_service.streams.rectify import Rectifier
 from vergence_service.streams.stream import Stream
 
 
-def view_of(frame: StereoFrame, rectifier: Rectifier, axes: Axes) -> View:
+def view_from_frame(frame: StereoFrame, rectifier: Rectifier, axes: Axes) -> StereoView:
     """The frame as the model sees it: rectified, its pose in OpenCV axes.
 
     Raises BadShape: images of another size than the rig's.
@@ -32,16 +32,16 @@ def view_of(frame: StereoFrame, rectifier: Rectifier, axes: Axes) -> View:
         world_from_left = axes.to_opencv(frame.pose.world_from_left)
         world_from_rectified = world_from_left @ rectifier.left_from_rectified
     position_known = frame.pose is not None and frame.pose.position_valid
-    return View(left, right, rig, frame.capture_ns, world_from_rectified, position_known)
+    return StereoView(left, right, rig, frame.capture_ns, world_from_rectified, position_known)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Answer:
+class SteppedFrame:
     """A step that was taken, on its way to becoming a disparity map."""
 
     stream: Stream
     frame_id: int
-    view: View
+    view: StereoView
     timed: TimedResult
     origin: Origin
     iterations: int
@@ -50,16 +50,16 @@ class Answer:
 
     def disparity_map(self) -> DisparityMap:
         """Works on whole images: to be called in a worker thread."""
-        result, opening = self.timed.result, self.stream.opening
+        result, config = self.timed.result, self.stream.config
         pose = self.view.world_from_left
         return DisparityMap(
             frame_id=self.frame_id,
             capture_ns=self.view.capture_ns,
             rig=self.view.rig,
             disparity_px=_disparity_px(result.offset_px, self.stream.rectifier),
-            sigma_px=result.sigma_px if opening.output.sigma else None,
-            confidence=_confidence(result.sigma_px) if opening.output.confidence else None,
-            world_from_left=None if pose is None else opening.axes.from_opencv(pose),
+            sigma_px=result.sigma_px if config.output.sigma else None,
+            confidence=_confidence(result.sigma_px) if config.output.confidence else None,
+            world_from_left=None if pose is None else config.axes.from_opencv(pose),
             origin=self.origin,
             step_count=result.state.step_count,
             iterations=self.iterations,

@@ -23,12 +23,12 @@ from vergence_proto.types import (
     Timings,
 )
 from vergence_service.inference.batcher import StepBatcher
-from vergence_service.inference.model import RecurrentState, Step, View, state_bytes
+from vergence_service.inference.model import RecurrentState, Step, StereoView, state_bytes
 from vergence_service.metrics import Metrics
 from vergence_service.streams.continuity import ContinuityLimits
-from vergence_service.streams.conversion import Answer, view_of
+from vergence_service.streams.conversion import SteppedFrame, view_from_frame
 from vergence_service.streams.rectify import Rectifier
-from vergence_service.streams.stream import Attachment, Notice, NoticeKind, Opening, Stream
+from vergence_service.streams.stream import Attachment, Notice, NoticeKind, Stream, StreamConfig
 from vergence_service.streams.table import StreamTable
 
 
@@ -71,7 +71,7 @@ class DepthEngine:
         return self._phase is _Phase.SERVING
 
     async def start(self) -> None:
-        """Load the model; until it is done every opening is refused with NotReady."""
+        """Load the model; until it is done every config is refused with NotReady."""
         counts = (self._iterations, *self._cold_iterations.values())
         await self._batcher.warm_up(*map(self.card.iterations_at_most, counts))
         self._phase = _Phase.SERVING
@@ -86,7 +86,7 @@ class DepthEngine:
     async def open(
         self,
         stream_id: str,
-        opening: Opening,
+        config: StreamConfig,
         *,
         attachment: Attachment | None = None,
         client: str = "",
@@ -96,12 +96,12 @@ class DepthEngine:
         Raises NotReady, Draining, ModelChanged, BadCalibration, FrameTooLarge, and as
         StreamTable.open.
         """
-        self._check_model(opening)
-        rectifier = await self._rectifier(opening.rig)
+        self._check_model(config)
+        rectifier = await self._rectifier(config.rig)
         reserve = state_bytes(self.card, rectifier.rig.height, rectifier.rig.width)
         return self.streams.open(
             stream_id,
-            opening,
+            config,
             rectifier,
             state_bytes=reserve,
             attachment=attachment,
@@ -112,7 +112,7 @@ class DepthEngine:
         self,
         stream_id: str,
         resume_token: bytes,
-        opening: Opening,
+        config: StreamConfig,
         *,
         attachment: Attachment,
         client: str = "",
@@ -124,9 +124,9 @@ class DepthEngine:
         self._check_serving()
         # Before the stream is looked for: a server that restarted has forgotten it, but that its
         # successor would be another network's is what the client must hear.
-        self._check_model(opening)
+        self._check_model(config)
         return self.streams.attach(
-            stream_id, resume_token, opening, attachment=attachment, client=client
+            stream_id, resume_token, config, attachment=attachment, client=client
         )
 
     async def step(
@@ -136,7 +136,7 @@ class DepthEngine:
         *,
         arrived_s: float,
         max_age_s: float | None = None,
-    ) -> Answer:
+    ) -> SteppedFrame:
         """Advance one stream by one frame; a step that failed has left the stream as it was.
 
         ``decode`` runs in a worker thread when the frame's turn has come, so a frame that is
@@ -149,23 +149,25 @@ class DepthEngine:
         self.streams.touch(stream)
         return await self._step(stream, decode, arrived_s=arrived_s, max_age_s=max_age_s)
 
-    async def open_apart(self, opening: Opening, *, state: RecurrentState | None = None) -> Stream:
+    async def open_offline(
+        self, config: StreamConfig, *, state: RecurrentState | None = None
+    ) -> Stream:
         """A stream that nobody attaches to, for a sequence that is known from its first frame on.
 
         It is in no table: it takes no place from live streams, and ends with its last reference.
         ``state`` is what the frames before have left. Raises NotReady, Draining, BadCalibration,
         FrameTooLarge.
         """
-        rectifier = await self._rectifier(opening.rig)
+        rectifier = await self._rectifier(config.rig)
         origin = Origin.COLD_START if state is None else Origin.WARM
         return Stream(
-            "", "", b"", opening, rectifier, 0, None, self._clock(), state=state, origin=origin
+            "", "", b"", config, rectifier, 0, None, self._clock(), state=state, origin=origin
         )
 
-    async def step_apart(
+    async def step_offline(
         self, stream: Stream, decode: Callable[[], StereoFrame]
     ) -> tuple[DisparityMap, RecurrentState]:
-        """As :meth:`step`, of a stream that :meth:`open_apart` made: the map, the state left."""
+        """As :meth:`step`, of a stream that :meth:`open_offline` made: the map, the state left."""
         answer = await self._step(stream, decode, arrived_s=self._clock(), max_age_s=None)
         return await asyncio.to_thread(answer.disparity_map), answer.timed.result.state
 
@@ -176,7 +178,7 @@ class DepthEngine:
         *,
         arrived_s: float,
         max_age_s: float | None,
-    ) -> Answer:
+    ) -> SteppedFrame:
         # The lock wakes its waiters in order, so a stream takes its frames one at a time as they
         # arrived, and no batch ever holds two frames of one stream.
         async with stream.turn:
@@ -223,10 +225,10 @@ class DepthEngine:
             case _Phase.DRAINING:
                 raise Draining("the server is shutting down; try another one")
 
-    def _check_model(self, opening: Opening) -> None:
-        if opening.weights_sha256 not in ("", self.card.weights_sha256):
+    def _check_model(self, config: StreamConfig) -> None:
+        if config.weights_sha256 not in ("", self.card.weights_sha256):
             raise ModelChanged(
-                f"expected a server with weights {opening.weights_sha256[:12]}, this one runs "
+                f"expected a server with weights {config.weights_sha256[:12]}, this one runs "
                 f"{self.card.name} with {self.card.weights_sha256[:12]}; open a new stream to go "
                 "on with those"
             )
@@ -246,18 +248,18 @@ class DepthEngine:
         decode: Callable[[], StereoFrame],
         arrived_s: float,
         max_age_s: float | None,
-    ) -> Answer:
+    ) -> SteppedFrame:
         started_s = self._clock()
         skipped = stream.frames_skipped
         frame, view = await asyncio.to_thread(_decoded_view, decode, stream)
         decode_s = self._clock() - started_s
         stream.check_order(frame.frame_id)
         state, origin = stream.state_before(view, self._limits)
-        iterations = self._iterations_of(stream.opening, cold=state is None)
+        iterations = self._iterations_of(stream.config, cold=state is None)
         timed = await self._batcher.step(
             Step(view, state, iterations),
             deadline_s=None if max_age_s is None else arrived_s + max_age_s,
-            live_stream=stream.stream_id if stream.opening.delivery is Delivery.NEWEST else None,
+            live_stream=stream.stream_id if stream.config.delivery is Delivery.NEWEST else None,
         )
         stream.commit(frame.frame_id, timed.result.state, frames_skipped=skipped)
         self.metrics.frames_stepped.labels(origin.name.lower()).inc()
@@ -268,17 +270,21 @@ class DepthEngine:
         )
         for stage in ("decode", "queue", "model"):
             self.metrics.stage_s.labels(stage).observe(getattr(timings, f"{stage}_s"))
-        return Answer(stream, frame.frame_id, view, timed, origin, iterations, skipped, timings)
+        return SteppedFrame(
+            stream, frame.frame_id, view, timed, origin, iterations, skipped, timings
+        )
 
-    def _iterations_of(self, opening: Opening, *, cold: bool) -> int:
+    def _iterations_of(self, config: StreamConfig, *, cold: bool) -> int:
         wanted = (
-            opening.cold_iterations or self._cold_iterations[opening.delivery]
+            config.cold_iterations or self._cold_iterations[config.delivery]
             if cold
-            else opening.iterations or self._iterations
+            else config.iterations or self._iterations
         )
         return self.card.iterations_at_most(wanted)
 
 
-def _decoded_view(decode: Callable[[], StereoFrame], stream: Stream) -> tuple[StereoFrame, View]:
+def _decoded_view(
+    decode: Callable[[], StereoFrame], stream: Stream
+) -> tuple[StereoFrame, StereoView]:
     frame = decode()
-    return frame, view_of(frame, stream.rectifier, stream.opening.axes)
+    return frame, view_from_frame(frame, stream.rectifier, stream.config.axes)

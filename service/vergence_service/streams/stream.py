@@ -8,7 +8,7 @@ from typing import Protocol
 from vergence_proto.errors import DepthError, FrameOutOfOrder
 from vergence_proto.geometry import Axes
 from vergence_proto.types import Delivery, Origin, OutputFormat, StereoRig
-from vergence_service.inference.model import RecurrentState, View
+from vergence_service.inference.model import RecurrentState, StereoView
 from vergence_service.streams.continuity import ContinuityLimits, break_between
 from vergence_service.streams.rectify import Rectifier
 
@@ -38,7 +38,7 @@ class Attachment(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Opening:
+class StreamConfig:
     """How a client wants its stream."""
 
     rig: StereoRig
@@ -57,7 +57,7 @@ class Stream:
     stream_id: str
     client: str  # whose share it counts to; empty: nobody's
     resume_token: bytes
-    opening: Opening
+    config: StreamConfig
     rectifier: Rectifier
     state_bytes: int  # reserved for it
     attachment: Attachment | None
@@ -80,7 +80,7 @@ class Stream:
             )
 
     def state_before(
-        self, view: View, limits: ContinuityLimits
+        self, view: StereoView, limits: ContinuityLimits
     ) -> tuple[RecurrentState | None, Origin]:
         """The state that ``view`` is stepped on, None for a cold start, and why."""
         if self.state is None:

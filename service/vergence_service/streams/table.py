@@ -19,7 +19,7 @@ from vergence_proto.errors import (
 from vergence_proto.types import Origin, StereoRig, checked_stream_id
 from vergence_service.metrics import Metrics
 from vergence_service.streams.rectify import Rectifier
-from vergence_service.streams.stream import Attachment, Notice, NoticeKind, Opening, Stream
+from vergence_service.streams.stream import Attachment, Notice, NoticeKind, Stream, StreamConfig
 
 # How long an expired stream is told apart from one that never was.
 _TOMBSTONE_S = 300.0
@@ -60,7 +60,7 @@ class StreamTable:
     def open(
         self,
         stream_id: str,
-        opening: Opening,
+        config: StreamConfig,
         rectifier: Rectifier,
         *,
         state_bytes: int,
@@ -104,7 +104,7 @@ class StreamTable:
             stream_id,
             client,
             secrets.token_bytes(16),
-            opening,
+            config,
             rectifier,
             state_bytes,
             attachment,
@@ -118,7 +118,7 @@ class StreamTable:
         self,
         stream_id: str,
         resume_token: bytes,
-        opening: Opening,
+        config: StreamConfig,
         *,
         attachment: Attachment,
         client: str,
@@ -131,7 +131,7 @@ class StreamTable:
         stream = self.get(stream_id)
         if not hmac.compare_digest(resume_token, stream.resume_token):
             raise StreamExists(f"stream {stream_id!r} is open and the resume token is not its own")
-        if not _same_rig(stream.opening.rig, opening.rig):
+        if not _same_rig(stream.config.rig, config.rig):
             raise BadCalibration(
                 f"stream {stream_id!r} was opened with another rig; open a new stream for this one"
             )
@@ -139,7 +139,7 @@ class StreamTable:
             stream.attachment.end(
                 Superseded(f"a newer connection attached to stream {stream_id!r}")
             )
-        stream.opening = opening
+        stream.config = config
         stream.attachment = attachment
         stream.client = client  # which may have come back by another network
         if stream.state is not None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from vergence_proto import codec
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.metrics import Metrics
-from vergence_service.streams.conversion import Answer
+from vergence_service.streams.conversion import SteppedFrame
 from vergence_service.streams.stream import Notice, NoticeKind
 
 # One map is encoded and sent while the next is stepped. Past it the stepper waits for the client
@@ -24,7 +24,7 @@ _NOTICE = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Map:
-    answer: Answer
+    answer: SteppedFrame
     arrived_s: float
 
 
@@ -71,7 +71,7 @@ class Outbox:
         """No map came of the frame."""
         self._unsent.release()
 
-    async def put_map(self, answer: Answer, *, arrived_s: float) -> None:
+    async def put_map(self, answer: SteppedFrame, *, arrived_s: float) -> None:
         """Into the room that was reserved; ``arrived_s`` is its frame's."""
         await self._answers.put(_Map(answer, arrived_s))
 
@@ -97,7 +97,7 @@ class Outbox:
         started_s = self._clock()
         answer, response = waiting.answer, pb.StreamDepthResponse()
         message = codec.disparity_to_proto(
-            answer.disparity_map(), answer.stream.opening.output, into=response.disparity
+            answer.disparity_map(), answer.stream.config.output, into=response.disparity
         )
         encode_s = self._clock() - started_s
         total_s = self._clock() - waiting.arrived_s

@@ -9,7 +9,7 @@ from vergence_proto import codec
 from vergence_proto.errors import BadShape, DepthError, StreamExists, UnknownStream
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.streams.engine import DepthEngine
-from vergence_service.streams.stream import Notice, Opening, Stream
+from vergence_service.streams.stream import Notice, Stream, StreamConfig
 from vergence_service.transports.mailbox import Letter, Mailbox
 from vergence_service.transports.outbox import Outbox
 from vergence_service.transports.unary import model_info
@@ -51,7 +51,7 @@ class DepthCall:
     def notify(self, notice: Notice) -> None:
         self._outbox.put_notice(notice)
 
-    async def tell_lost(self, frame_ids: Sequence[int]) -> None:
+    async def report_lost(self, frame_ids: Sequence[int]) -> None:
         """Count and answer frames that, as the transport knows, were sent and never came."""
         if self._stream is not None and frame_ids:
             await self._drop(self._stream, frame_ids)
@@ -85,7 +85,7 @@ class DepthCall:
 
     async def _serve(self, stream: Stream) -> None:
         mailbox: Mailbox[pb.Frame]
-        mailbox = Mailbox(stream.opening.delivery, capacity=self._limits.waiting_frames)
+        mailbox = Mailbox(stream.config.delivery, capacity=self._limits.waiting_frames)
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._outbox.send())
             self._reader = tasks.create_task(self._read(stream, mailbox))
@@ -98,7 +98,7 @@ class DepthCall:
         if first is None or not first.HasField("open"):
             raise UnknownStream("the first message of a call must open or resume a stream")
         request = first.open
-        opening = Opening(
+        config = StreamConfig(
             rig=codec.rig_from_proto(request.rig),
             axes=codec.axes_from_proto(request.axes),
             delivery=codec.delivery_from_proto(request.delivery),
@@ -111,13 +111,13 @@ class DepthCall:
             resumed = self._engine.resume(
                 request.stream_id,
                 request.resume_token,
-                opening,
+                config,
                 attachment=self,
                 client=self._client,
             )
             return resumed, True
         opened = await self._engine.open(
-            request.stream_id, opening, attachment=self, client=self._client
+            request.stream_id, config, attachment=self, client=self._client
         )
         return opened, False
 

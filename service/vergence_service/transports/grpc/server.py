@@ -12,7 +12,7 @@ from grpc_reflection.v1alpha import reflection
 from vergence_proto.errors import BadShape
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.v1 import depth_pb2_grpc
-from vergence_service.transports.addresses import place
+from vergence_service.transports.addresses import format_address
 from vergence_service.transports.errors import PortTaken
 from vergence_service.transports.grpc.errors import Context, errors_as_status
 from vergence_service.transports.open_calls import OpenCalls
@@ -99,7 +99,7 @@ class GrpcServer:
         self, servicer: DepthServicer, *, host: str, port: int, max_frame_bytes: int
     ) -> None:
         self._servicer = servicer
-        self._address = place(host, port)
+        self._address = format_address(host, port)
         self._max_message_bytes = int(max_frame_bytes * _ROOM_OVER_THE_LIMIT)
         self._health = health.aio.HealthServicer()  # type: ignore[attr-defined] # bound at import
         self.port = port

@@ -17,7 +17,7 @@ from vergence_proto.geometry import RectifiedRig
 from vergence_proto.types import Delivery, Image, Plane, StereoFrame, StereoRig
 from vergence_service.jobs.upload_checks import check_file
 from vergence_service.streams.engine import DepthEngine
-from vergence_service.streams.stream import Opening
+from vergence_service.streams.stream import StreamConfig
 from vergence_service.transports.http.errors import PROBLEM_RESPONSE
 from vergence_service.transports.http.uploads import (
     FORM_TYPE,
@@ -97,14 +97,14 @@ def pair_routes(engine: DepthEngine, *, limits: UploadLimits) -> APIRouter:
         )
         if query.output is PairOutput.DEPTH and not (query.fx_px and query.baseline_m):
             raise BadCalibration("depth needs fx_px and baseline_m; without them take disparity")
-        opening = Opening(
+        config = StreamConfig(
             StereoRig.from_rectified(rig),
             delivery=Delivery.EVERY,
             cold_iterations=query.iterations,
         )
-        stream = await engine.open_apart(opening)
+        stream = await engine.open_offline(config)
         frame = StereoFrame(1, 0, left, right)
-        disparity, _ = await engine.step_apart(stream, lambda: frame)
+        disparity, _ = await engine.step_offline(stream, lambda: frame)
         wanted = disparity.depth_m if query.output is PairOutput.DEPTH else disparity.disparity_px
         return await asyncio.to_thread(_encoded, wanted, query.format)
 

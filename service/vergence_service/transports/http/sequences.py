@@ -174,7 +174,7 @@ def sequence_routes(
             metrics=query.metrics,
         )
         client = client_of(request)
-        async with queue.place(client) as folder:
+        async with queue.reserve_slot(client) as folder:
             await receive_sequence(request, folder, limits)
             status = await queue.accept(folder, query.source, options, client=client)
         job_id = status.job.job_id
@@ -210,7 +210,7 @@ def sequence_routes(
         },
     )
     async def events(job_id: str) -> StreamingResponse:
-        """Progress, as it is made."""
+        """JobProgress, as it is made."""
         queue.status(job_id)
         return StreamingResponse(
             _events(queue, job_id, stopping),

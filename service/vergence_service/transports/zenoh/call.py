@@ -90,7 +90,7 @@ class ZenohCall:
         if last is not None:
             # A client has no more than its credit unanswered, so no more can be missing.
             oldest = max(last + 1, frame_id - self._calls.limits.credit)
-            await self._call.tell_lost(range(oldest, frame_id))
+            await self._call.report_lost(range(oldest, frame_id))
         self._last_frame_id = frame_id
         self._unanswered.add(frame_id)
 
@@ -114,7 +114,7 @@ class ZenohCall:
                 await self._send(self._keys.status, response)
 
     async def _accept(self, opened: pb.StreamOpened) -> None:
-        """Answer the query, ready for the frames that follow at once."""
+        """SteppedFrame the query, ready for the frames that follow at once."""
         self._keys = StreamKeys(self._namespace, opened.stream_id)
         self._subscription = await self._peer.subscribe(self._keys.frames, self._inbox.put)
         query, self._query = self._query, None

@@ -85,7 +85,7 @@ class ZenohServer:
         await self._peer.close()
 
     async def serving(self) -> None:
-        """Answer, and tell those on the network that this server lives."""
+        """SteppedFrame, and tell those on the network that this server lives."""
         peer, namespace = self._peer, self._namespace
         client_keys = StreamKeys(namespace, ANY).client(ANY)
         # Held for as long as this server serves: Zenoh ends what nobody refers to.
