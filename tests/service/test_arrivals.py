@@ -117,18 +117,18 @@ async def test_no_step_waits_for_ever() -> None:
     assert 20 < taken < 35, "expected it after two seconds of live steps"
 
 
-def test_a_rhythm_is_learned_and_forgotten() -> None:
-    rhythm = ArrivalPredictor()
-    rhythm.arrived("a", 1.0)
-    assert rhythm.next_expected(1.0) is None
-    rhythm.arrived("a", 1.5)
-    assert rhythm.next_expected(1.5) == ExpectedFrame(2.0, 2.25)
-    rhythm.arrived("b", 1.5)
-    rhythm.arrived("b", 1.6)
-    assert rhythm.next_expected(1.6) == ExpectedFrame(1.6 + (1.6 - 1.5), 1.6 + 1.5 * (1.6 - 1.5))
-    assert rhythm.next_expected(1.9) == ExpectedFrame(2.0, 2.25), "b has stopped"
-    assert rhythm.next_expected(2.3) is None, "both have"
-    rhythm.answered("a", 2.4)
-    assert rhythm.next_expected(2.4) == ExpectedFrame(2.0, 2.65), (
+def test_a_cadence_is_learned_and_forgotten() -> None:
+    predictor = ArrivalPredictor()
+    predictor.arrived("a", 1.0)
+    assert predictor.next_expected(1.0) is None
+    predictor.arrived("a", 1.5)
+    assert predictor.next_expected(1.5) == ExpectedFrame(2.0, 2.25)
+    predictor.arrived("b", 1.5)
+    predictor.arrived("b", 1.6)
+    assert predictor.next_expected(1.6) == ExpectedFrame(1.6 + (1.6 - 1.5), 1.6 + 1.5 * (1.6 - 1.5))
+    assert predictor.next_expected(1.9) == ExpectedFrame(2.0, 2.25), "b has stopped"
+    assert predictor.next_expected(2.3) is None, "both have"
+    predictor.answered("a", 2.4)
+    assert predictor.next_expected(2.4) == ExpectedFrame(2.0, 2.65), (
         "a was kept waiting and could not send"
     )

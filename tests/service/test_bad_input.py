@@ -88,7 +88,7 @@ def too_large(frame: pb.Frame) -> None:
         pytest.param(long_quaternion, "BAD_POSE", "unit", id="non-unit-quaternion"),
         pytest.param(out_of_order, "FRAME_OUT_OF_ORDER", "above 1", id="out-of-order"),
         pytest.param(too_large, "FRAME_TOO_LARGE", "1048576", id="too-large"),
-        pytest.param(first_pixel(RAISES), "MODEL_FAILED", "as it was", id="model-raises"),
+        pytest.param(first_pixel(RAISES), "MODEL_FAILED", "unchanged", id="model-raises"),
         pytest.param(first_pixel(NOT_FINITE), "NON_FINITE", "finite", id="not-finite"),
     ],
 )

@@ -252,9 +252,9 @@ def a_stage_twice(graphs: Graphs) -> None:
     ("change", "says"),
     [
         (without_the_first_stage, "expected left_light, moved, sigma from a graph of an earlier"),
-        (without_the_last_stage, "no graph gives disparity, next_memory"),
+        (without_the_last_stage, "no graph computes disparity, next_memory"),
         (all_in_one_stage, "expected left_light, moved, sigma from a graph of an earlier"),
-        (a_stage_twice, "more than one graph gives left_light, moved"),
+        (a_stage_twice, "more than one graph computes left_light, moved"),
     ],
 )
 def test_graphs_that_do_not_fit_together_are_refused_when_they_are_loaded(

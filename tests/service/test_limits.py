@@ -47,7 +47,7 @@ async def test_a_client_that_has_its_share_is_told_so_and_leaves_room_to_others(
         assert 0 < seconds_to_wait(failure.value) <= 60
         # A share is an address's, by whatever door; to come back to what one has takes no other.
         async with DepthClient(f"http://{server.http_address}") as same:
-            with pytest.raises(Quota, match=r"127\.0\.0\.1 holds 1 streams"):
+            with pytest.raises(Quota, match=r"127\.0\.0\.1 has 1 open streams"):
                 async with same.open_session(RIG):
                     pass
         token = mine.opened.resume_token

@@ -51,7 +51,9 @@ class RecallModel:
             if row.view.left[0, 0, 0] == RAISES:
                 raise ArithmeticError("lens flare in /srv/secret.py")
             if row.view.left[0, 0, 0] == NOT_FINITE:
-                raise NonFinite("the network's result was not finite; the stream starts anew")
+                raise NonFinite(
+                    "the network's result was not finite; the stream starts again without a state"
+                )
         return [self._step_one(row) for row in steps]
 
     def _step_one(self, row: Step) -> StepResult:

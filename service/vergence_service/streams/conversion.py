@@ -1,4 +1,4 @@
-"""The border between a client's frames and the model's views: rectification, axes, no values."""
+"""Convert between a client's frames and the model's views: rectification, axes, missing values."""
 
 from dataclasses import dataclass
 
@@ -8,16 +8,15 @@ from numpy.typing import NDArray
 from vergence_proto.errors import BadShape
 from vergence_proto.geometry import Axes, Pose
 from vergence_proto.types import DisparityMap, Origin, Plane, StereoFrame, Timings
-from vergence_service.inference.batcher import TimedResult
-from vergence_service.inference.model import StereoView
+from vergence_service.inference.model import StepResult, StereoView
 from vergence_service.streams.rectify import Rectifier
 from vergence_service.streams.stream import Stream
 
 
 def view_from_frame(frame: StereoFrame, rectifier: Rectifier, axes: Axes) -> StereoView:
-    """The frame as the model sees it: rectified, its pose in OpenCV axes.
+    """Convert a frame to the model's input: rectified images, and the pose in OpenCV axes.
 
-    Raises BadShape: images of another size than the rig's.
+    Raises BadShape if the images do not have the size of the rig.
     """
     rig = rectifier.rig
     height, width = frame.left.shape[:2]
@@ -37,20 +36,21 @@ def view_from_frame(frame: StereoFrame, rectifier: Rectifier, axes: Axes) -> Ste
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SteppedFrame:
-    """A step that was taken, on its way to becoming a disparity map."""
+    """A frame that was stepped, before its answer is made."""
 
     stream: Stream
     frame_id: int
+    arrived_s: float
     view: StereoView
-    timed: TimedResult
+    result: StepResult
     origin: Origin
     iterations: int
     frames_skipped: int
-    timings: Timings
+    timings: Timings  # up to the end of the step
 
     def disparity_map(self) -> DisparityMap:
-        """Works on whole images: to be called in a worker thread."""
-        result, config = self.timed.result, self.stream.config
+        """Make the answer. This works on whole images: call it in a worker thread."""
+        result, config = self.result, self.stream.config
         pose = self.view.world_from_left
         return DisparityMap(
             frame_id=self.frame_id,
@@ -69,19 +69,19 @@ class SteppedFrame:
 
 
 def _disparity_px(offset_px: Plane, rectifier: Rectifier) -> Plane:
-    """Pixel offset to disparity: NaN where it is not positive or the camera saw nothing."""
+    """Convert pixel offset to disparity: NaN if it is not positive or the camera saw nothing."""
     disparity_px = offset_px - np.float32(rectifier.rig.offset_of_zero_disparity_px)
-    there = disparity_px > 0
+    valid = disparity_px > 0
     if rectifier.seen is not None:
-        there &= rectifier.seen
-    disparity_px[~there] = np.nan
+        valid &= rectifier.seen
+    disparity_px[~valid] = np.nan
     return disparity_px
 
 
 def _confidence(sigma_px: Plane) -> NDArray[np.uint8]:
-    """The probability of an error below one pixel, times 255.
+    """Return the probability of an error below one pixel, times 255.
 
-    Of a Laplace distribution, whose expected absolute error is its scale.
+    The error is modelled as a Laplace distribution, whose expected absolute error is its scale.
     """
     probability: Plane = 1 - np.exp(-1 / np.maximum(sigma_px, np.float32(1e-6)))
     return np.rint(probability * 255).astype(np.uint8)
