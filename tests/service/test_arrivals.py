@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 from tests.service.test_batcher import make_batcher, make_step
 from tests.support.models import RecallModel
+from tests.support.polling import PATIENCE_S, turns
 from tests.support.server import ManualClock
 from vergence_service.inference.arrivals import ArrivalPredictor, ExpectedFrame
 from vergence_service.inference.batcher import StepBatcher
@@ -55,27 +56,25 @@ async def test_a_step_that_would_be_in_the_way_of_a_live_frame_waits_for_it() ->
             clock.advance(0.1 - STEP_S)
         clock.advance(-0.01)
         other = asyncio.create_task(batcher.step(make_step(OTHER + 1)))
-        await asyncio.sleep(0.02)
-        assert not other.done()
+        await turns()  # the batcher sees it, alone in the queue
         clock.advance(0.01)
         await live(batcher)
         clock.advance(3.0)  # the live stream has ended
-        await asyncio.wait_for(other, 5.0)
+        await asyncio.wait_for(other, PATIENCE_S)
     assert model.stepped == [OTHER, LIVE, LIVE, LIVE, LIVE, OTHER + 1]
 
 
 async def test_a_free_lane_is_not_for_others_while_a_live_step_is_in_the_model() -> None:
-    model = RecallModel(max_concurrent_steps=2)
-    async with make_batcher(model) as batcher:
+    clock, model = ManualClock(), RecallModel(max_concurrent_steps=2)
+    async with make_batcher(model, clock=clock) as batcher:
         with model.busy():
             urgent = asyncio.create_task(live(batcher))
             await asyncio.to_thread(model.wait_until_entered)
             other = asyncio.create_task(batcher.step(make_step(OTHER)))
-            await asyncio.sleep(0.02)
-            assert model.batches == [1]
-            model.batches.clear()
-        await asyncio.wait_for(asyncio.gather(urgent, other), 1.0)
-    assert model.batches == [1]
+            await turns()  # a step that may start has started by now
+            clock.advance(0.5)
+        await asyncio.wait_for(asyncio.gather(urgent, other), PATIENCE_S)
+    assert other.result()[1].queue_s == 0.5
 
 
 async def test_a_live_step_takes_the_free_lane_beside_another() -> None:
@@ -97,7 +96,8 @@ async def test_a_step_that_fits_into_the_gap_is_taken_at_once() -> None:
             await live(batcher)
             clock.advance(0.5 - STEP_S)
         await live(batcher)
-        await asyncio.wait_for(batcher.step(make_step(OTHER)), 0.2)
+        _, timings = await asyncio.wait_for(batcher.step(make_step(OTHER)), PATIENCE_S)
+    assert timings.queue_s == 0
 
 
 async def test_no_step_waits_for_ever() -> None:

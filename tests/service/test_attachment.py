@@ -8,6 +8,7 @@ import pytest
 
 from tests.support.frames import RIG, frame_message, make_frame, open_message
 from tests.support.models import RecallModel
+from tests.support.polling import eventually
 from tests.support.server import ManualClock, RawCall, connected, raw_stream, running_server
 from tests.support.status import reason_of
 from vergence_proto.types import StereoRig
@@ -17,9 +18,7 @@ from vergence_service.app.server import Running
 
 async def detached(server: Running, stream_id: str) -> None:
     """Wait until the server has noticed that the connection is gone."""
-    async with asyncio.timeout(10):
-        while server.engine.streams.get(stream_id).attachment is not None:  # noqa: ASYNC110
-            await asyncio.sleep(0.005)
+    await eventually(lambda: server.engine.streams.get(stream_id).attachment is None)
 
 
 async def reference_map() -> bytes:

@@ -10,6 +10,7 @@ from prometheus_client import CollectorRegistry
 
 from tests.support.frames import RIG, make_frame
 from tests.support.models import NOT_FINITE, RAISES, RecallModel
+from tests.support.polling import turns
 from tests.support.server import ManualClock
 from vergence_proto.errors import Draining, FrameStale, ModelFailed, NonFinite
 from vergence_proto.geometry import RectifiedRig
@@ -154,13 +155,15 @@ async def test_waiters_are_told_when_the_batcher_ends(lanes: int) -> None:
 
 
 async def test_lanes_are_filled_as_steps_arrive_and_taken_by_one_step_each() -> None:
-    model = RecallModel(max_concurrent_steps=2)
-    async with make_batcher(model, max_batch=8) as batcher:
+    clock, model = ManualClock(), RecallModel(max_concurrent_steps=2)
+    async with make_batcher(model, max_batch=8, clock=clock) as batcher:
         with model.busy():
             steps = [*await all_in_the_model(batcher, model)]
             steps += [asyncio.create_task(batcher.step(make_step(i))) for i in range(50, 55)]
-            await asyncio.sleep(0.02)
-            assert model.batches == [1, 1], "more steps were in the model than it has lanes"
+            await turns()  # a step that may start has started by now
+            clock.advance(0.5)
+        waited_s = [timings.queue_s for _, timings in await asyncio.gather(*steps)]
+        assert waited_s == [0, 0, *[0.5] * 5], "a step waits until a lane is free"
         for step, brightness in zip(steps, [1, 2, *range(50, 55)], strict=True):
             expected = model.step([make_step(brightness)])[0].offset_px
             np.testing.assert_array_equal((await step)[0].offset_px, expected)

@@ -20,8 +20,9 @@ from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weig
 from vergence_service.inference.snapshots import BadSnapshot, state_from_bytes, state_to_bytes
 from vergence_service.jobs.checkpoints import read_checkpoint, write_checkpoint
 from vergence_service.jobs.job import Job, JobOptions
+from vergence_service.jobs.progress import JobProgress
 from vergence_service.jobs.results import read_frames
-from vergence_service.jobs.run import JobProgress, run_job
+from vergence_service.jobs.run import run_job
 
 FRAMES = 24
 

@@ -20,6 +20,7 @@ from tests.support.http import (
     submit,
 )
 from tests.support.models import RAISES, RecallModel
+from tests.support.polling import eventually
 from tests.support.sequences import make_frames, sequence_files, zip_bytes
 from tests.support.server import raw_stream, running_server
 from vergence_proto.jobs import JobState
@@ -95,9 +96,7 @@ async def test_results_expire_by_age(tmp_path: Path) -> None:
         await ended(client, job["id"])
         assert files_below(tmp_path / "jobs")
     async with http_server(RecallModel(), batch__directory=tmp_path, batch__keep_h=1e-9) as client:
-        async with asyncio.timeout(20):
-            while files_below(tmp_path / "jobs"):  # noqa: ASYNC110  the files are all that tells
-                await asyncio.sleep(0.01)
+        await eventually(lambda: not files_below(tmp_path / "jobs"))
         assert (await client.get("/v1/sequences")).json() == []
 
 

@@ -1,4 +1,4 @@
-"""The composition of the HTTP face: jobs on disk, routes, and the server that offers them."""
+"""Compose the HTTP transport: the jobs on disk, the routes and their server."""
 
 import asyncio
 import logging
@@ -31,8 +31,10 @@ _MIB = 1 << 20
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HttpTransport:
+    """The HTTP server while it runs."""
+
     server: HttpServer
-    start_jobs: Callable[[], None]  # once the model is there
+    start_jobs: Callable[[], None]  # call it when the model is loaded
 
 
 @asynccontextmanager
@@ -44,7 +46,10 @@ async def serving_http(
     calls: OpenCalls,
     registry: CollectorRegistry,
 ) -> AsyncIterator[HttpTransport]:
-    """Listen and answer, to the end of the block. Raises PortTaken."""
+    """Serve HTTP until the end of the block.
+
+    Raises PortTaken if the server cannot listen on ``host``.
+    """
     batch = settings.batch
     archive = ArchiveLimits(
         max_files=batch.max_files,
@@ -66,8 +71,8 @@ async def serving_http(
         try:
             store = stack.enter_context(JobStore(batch.directory or _default_jobs_directory()))
         except StoreUnavailable as error:
-            # Live depth is worth serving without a disk.
-            log.warning("sequences are not taken: %s", error)
+            # Without a disk the server can still serve live streams.
+            log.warning("this server accepts no sequences: %s", error)
             routes.append(no_sequence_routes(str(error)))
             start = _nothing
         else:
@@ -101,7 +106,7 @@ async def serving_http(
 
 
 def _nothing() -> None:
-    """No jobs are to be started."""
+    """Start no jobs, because there is no queue."""
 
 
 def _default_jobs_directory() -> Path:

@@ -1,4 +1,4 @@
-"""The composition root: settings in, a running server out."""
+"""Compose the server from its settings, run it, and drain it at the end."""
 
 import asyncio
 import signal
@@ -33,7 +33,7 @@ _SWEEP_EVERY_S = 1.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Running:
-    """A server that serves."""
+    """A server while it serves."""
 
     grpc_address: str
     http_address: str
@@ -44,7 +44,11 @@ class Running:
 
 
 def make_model(settings: Settings) -> OnnxStereoModel:
-    """Raises ManifestError, ProviderUnavailable, FileNotFoundError: no such weights here."""
+    """Load the model card of the settings.
+
+    Raises ManifestError if the manifest cannot be used, ProviderUnavailable if an execution
+    provider is missing, and FileNotFoundError if there are no weights.
+    """
     return OnnxStereoModel(
         settings.model.weights or packaged_weights_dir(),
         settings.model.name,
@@ -58,9 +62,11 @@ def make_model(settings: Settings) -> OnnxStereoModel:
 async def running(
     settings: Settings, model: StereoModel, *, clock: Callable[[], float] = time.monotonic
 ) -> AsyncIterator[Running]:
-    """A server from its first listening socket to its last; inside the block it serves.
+    """Run a server; it serves until the end of the block.
 
-    Raises PortTaken, ExtraMissing, ZenohUnreachable, and what the model raises when it loads.
+    Raises PortTaken if a port is in use, ExtraMissing if Zenoh is not installed, ZenohUnreachable
+    if its network cannot be joined, and ManifestError or ProviderUnavailable if the model cannot
+    be loaded.
     """
     registry = CollectorRegistry()
     metrics = Metrics(registry)
@@ -107,7 +113,7 @@ async def running(
 
     grpc_host = settings.grpc.host or settings.server.host
     http_host = settings.http.host or settings.server.host
-    # Outermost ends last: no transport outlives the batcher that it feeds.
+    # The outermost context ends last: no transport outlives the batcher that it uses.
     async with (
         batcher,
         GrpcServer(
@@ -136,7 +142,11 @@ async def running(
 
 
 async def serve(settings: Settings, *, on_serving: Callable[[Running], None]) -> None:
-    """Serve until SIGTERM or SIGINT, then drain. Raises as make_model and running."""
+    """Serve until SIGTERM or SIGINT, then drain.
+
+    Raises FileNotFoundError, ManifestError or ProviderUnavailable if the model cannot be loaded;
+    PortTaken, ExtraMissing or ZenohUnreachable if a transport cannot start.
+    """
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -149,7 +159,7 @@ async def serve(settings: Settings, *, on_serving: Callable[[Running], None]) ->
 
 
 async def drain(server: Running, *, within_s: float) -> None:
-    """Tell clients, let them leave, answer what they have sent; within twice the time given."""
+    """Notify clients, let them leave, and answer what they have sent, in twice ``within_s``."""
     server.engine.drain(within_s=within_s)
     async with asyncio.TaskGroup() as tasks:
         tasks.create_task(server.grpc.drain(within_s=within_s))

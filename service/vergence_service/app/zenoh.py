@@ -1,4 +1,4 @@
-"""The composition of the Zenoh face, if it is wanted: where it is found, and what answers there."""
+"""Compose the Zenoh transport, if the settings enable it."""
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -11,23 +11,29 @@ from vergence_service.transports.errors import ExtraMissing
 from vergence_service.transports.open_calls import OpenCalls
 from vergence_service.transports.unary import UnaryMethods
 
-if TYPE_CHECKING:  # Zenoh is an extra
+if TYPE_CHECKING:  # Zenoh is an optional extra
     from vergence_service.transports.zenoh.server import ZenohServer
 
-_ROUTER_PORT = 7447  # by custom
+_ROUTER_PORT = 7447  # Zenoh's default port
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ZenohTransport:
+    """The Zenoh server while it runs."""
+
     server: "ZenohServer"
-    endpoint: str  # where clients find it, or the file that says so
+    endpoint: str  # the endpoint for clients, or the file that configures it
 
 
 @asynccontextmanager
 async def serving_zenoh(
     settings: Settings, unary: UnaryMethods, calls: OpenCalls
 ) -> AsyncIterator[ZenohTransport | None]:
-    """On the network to the end of the block. Raises ExtraMissing, ZenohUnreachable."""
+    """Serve over Zenoh until the end of the block, or yield None if it is not enabled.
+
+    Raises ExtraMissing if Zenoh is not installed, and ZenohUnreachable if the network cannot be
+    joined.
+    """
     chosen = settings.zenoh
     if not chosen.enabled:
         yield None
