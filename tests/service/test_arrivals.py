@@ -1,4 +1,4 @@
-"""Live first: other steps fill the gaps between live frames, and are not in the way of the next."""
+"""Live steps run first; other steps run in the gaps and do not delay the next live frame."""
 
 import asyncio
 from collections.abc import Sequence
@@ -12,11 +12,11 @@ from vergence_service.inference.batcher import StepBatcher
 from vergence_service.inference.model import Step, StepResult
 
 STEP_S = 0.08
-LIVE, OTHER = 200, 10  # brightness, by which the model tells them apart
+LIVE, OTHER = 200, 10  # brightness, by which the test distinguishes steps
 
 
 class TimedModel(RecallModel):
-    """Every step takes as long, by the clock of the test; the order of steps is kept."""
+    """A model whose steps all take STEP_S by the test's clock. It records their order."""
 
     def __init__(self, clock: ManualClock) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Who has a stream: losing the connection is not losing the state, and the newest one wins."""
+"""A stream keeps its state when its connection is lost, and the newest connection wins."""
 
 import asyncio
 from dataclasses import replace
@@ -22,7 +22,7 @@ async def detached(server: Running, stream_id: str) -> None:
 
 
 async def reference_map() -> bytes:
-    """Frame 2 of a stream that nothing happened to."""
+    """The answer to frame 2 of an undisturbed stream."""
     async with running_server(RecallModel()) as server, raw_stream(server) as call:
         await call.ask(frame_message(make_frame(1)))
         return (await call.ask(frame_message(make_frame(2)))).disparity.disparity.data

@@ -39,7 +39,7 @@ def make_step(brightness: int, *, rig: RectifiedRig = RIG, iterations: int = 1) 
 async def all_in_the_model(
     batcher: StepBatcher, model: RecallModel, brightnesses: Sequence[int] = ()
 ) -> list[asyncio.Task[tuple[StepResult, Timings]]]:
-    """As many steps as the model has lanes, all of them in it; it is busy."""
+    """Start as many steps as the model has lanes, and wait until the model has all of them."""
     steps = []
     for brightness in brightnesses or range(1, model.max_concurrent_steps + 1):
         steps.append(asyncio.create_task(batcher.step(make_step(brightness))))
@@ -50,7 +50,7 @@ async def all_in_the_model(
 async def gathered_behind_another(
     batcher: StepBatcher, model: RecallModel, steps: list[Step]
 ) -> list[tuple[StepResult, Timings] | BaseException]:
-    """All of ``steps`` wait together while another one is in the model."""
+    """Let all ``steps`` wait together while another step is in the model."""
     with model.busy():
         first = asyncio.create_task(batcher.step(make_step(1)))
         await asyncio.to_thread(model.wait_until_entered)
@@ -142,7 +142,7 @@ async def test_a_caller_that_gives_up_does_not_stop_the_others() -> None:
 
 
 @pytest.mark.parametrize("lanes", [1, 2])
-async def test_waiters_are_told_when_the_batcher_ends(lanes: int) -> None:
+async def test_waiters_get_an_error_when_the_batcher_ends(lanes: int) -> None:
     model = RecallModel(max_concurrent_steps=lanes)
     with model.busy():
         async with make_batcher(model) as batcher:

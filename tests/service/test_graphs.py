@@ -51,7 +51,7 @@ def make_view(frame_id: int) -> StereoView:
 
 
 def walk(model: OnnxStereoModel, *, first: int = 1, frames: int = 4) -> list[StepResult]:
-    """A sequence that starts with two iterations and goes on with one."""
+    """A sequence that starts with two iterations and continues with one."""
     state: RecurrentState | None = None
     results = []
     for i in range(first, first + frames):

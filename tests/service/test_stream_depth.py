@@ -91,7 +91,7 @@ async def test_the_newest_frame_wins_and_every_frame_is_answered_once() -> None:
             await asyncio.to_thread(model.wait_until_entered)
             for i in range(2, 9):
                 await call.send(frame_message(make_frame(i)))
-            # Each of them displaces the one before; when the last drop is told, 8 is waiting.
+            # Each of them displaces the one before; when the last drop is reported, 8 is waiting.
             dropped = [await call.receive() for _ in range(6)]
         await call.send(END)
         answers = [answer for answer in dropped if answer is not None]

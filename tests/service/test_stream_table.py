@@ -31,7 +31,7 @@ RECTIFIER = Rectifier.of(RIG_OPENING.rig)
 
 
 class Connection:
-    """Records what it is told."""
+    """An attachment that records its notices and its end."""
 
     def __init__(self) -> None:
         self.notices: list[Notice] = []

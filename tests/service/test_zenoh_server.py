@@ -1,4 +1,4 @@
-"""What the Zenoh network sees of a server: keys, encodings, answers to clients not of ours."""
+"""The server as seen from the Zenoh network: keys, encodings, answers to foreign clients."""
 
 import sys
 from collections.abc import AsyncIterator
@@ -30,7 +30,7 @@ KEYS = StreamKeys(NAMESPACE, "s")
 
 
 class Client:
-    """A client of its own making, message by message."""
+    """A client without the SDK, message by message."""
 
     def __init__(self, peer: ZenohPeer) -> None:
         self.peer = peer
@@ -157,7 +157,7 @@ async def test_a_lossless_client_that_breaks_its_credit_is_ended() -> None:
             for frame_id in range(1, 41):
                 await client.send_frame(frame_id)
         answered = []
-        # A frame that the network lost is told of between the answers.
+        # A frame that the network lost is reported between the answers.
         while not isinstance(answer := await client.inbox.take(), status_pb2.Status):
             if isinstance(answer, pb.DisparityMap):
                 answered.append(answer.frame_id)

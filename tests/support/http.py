@@ -1,4 +1,4 @@
-"""HTTP to a server in this process, and what its answers hold."""
+"""HTTP clients of a server in this process, and readers of its answers."""
 
 import io
 import zipfile
@@ -60,14 +60,14 @@ async def disparities(client: httpx.AsyncClient, job_id: str) -> list[NDArray[np
 
 
 def disparities_in(archive: bytes) -> list[NDArray[np.float32]]:
-    """Of a result as a zip of npz, in order."""
+    """The maps in a result, a zip of npz files, in order."""
     with zipfile.ZipFile(io.BytesIO(archive)) as file:
         names = sorted(name for name in file.namelist() if name.endswith(".npz"))
         return [np.load(io.BytesIO(file.read(name)))["disparity"] for name in names]
 
 
 def reason_of(answer: httpx.Response) -> str:
-    """Of a refusal, which must be told as a problem."""
+    """The reason of a refusal, which must be problem details."""
     assert answer.headers["Content-Type"] == "application/problem+json", answer.text
     problem = answer.json()
     assert problem["status"] == answer.status_code

@@ -1,4 +1,4 @@
-"""A network small enough to know by heart: its memory, its failures and its pace are visible."""
+"""A tiny fake network: its memory, its failures and its pace are visible."""
 
 import threading
 import time
@@ -83,7 +83,7 @@ class RecallModel:
 
 
 class PacedModel(RecallModel):
-    """Takes its time, so that others can see how far a sequence is."""
+    """A model whose steps take ``step_s``, so that tests can see the progress of a sequence."""
 
     def __init__(self, step_s: float) -> None:
         super().__init__()

@@ -65,9 +65,8 @@ class JobStore:
             # servers that ran the same jobs would overwrite each other's files.
             self._database.execute("PRAGMA locking_mode = EXCLUSIVE")
             self._database.execute("PRAGMA journal_mode = WAL")
-            self._database.execute(
-                "PRAGMA synchronous = FULL"
-            )  # an accepted job survives a power cut
+            # An accepted job survives a power cut.
+            self._database.execute("PRAGMA synchronous = FULL")
             self._database.execute(_TABLE)
             self._clear_leftovers()
         except sqlite3.Error as error:

@@ -70,7 +70,7 @@ class DepthEngine:
 
     @property
     def ready(self) -> bool:
-        """Whether new streams are accepted."""
+        """True while new streams are accepted."""
         return self._phase is _Phase.SERVING
 
     async def start(self) -> None:
