@@ -8,6 +8,7 @@ import pytest
 from tests.support.frames import RIG
 from tests.support.http import disparities, ended, http_to, submit
 from tests.support.models import RecallModel
+from tests.support.polling import eventually, eventually_true
 from tests.support.proxy import proxy_to
 from tests.support.sequences import make_frames, sequence_files, zip_bytes
 from tests.support.server import running_server
@@ -110,9 +111,7 @@ async def test_a_session_resumes_over_a_connection_that_broke() -> None:
             results = [await step(session, frame) for frame in FRAMES[:3]]
             proxy.cut()
             proxy.mend()
-            async with asyncio.timeout(10):
-                while EventKind.RESUMED not in [event.kind for event in events]:  # noqa: ASYNC110
-                    await asyncio.sleep(0.01)
+            await eventually(lambda: EventKind.RESUMED in [event.kind for event in events])
             results += [await step(session, frame) for frame in FRAMES[3:]]
         async with DepthClient(f"grpc://{server.grpc_address}") as client:
             undisturbed = await stepped(client)
@@ -127,9 +126,11 @@ async def test_a_client_that_vanished_leaves_its_stream_to_another() -> None:
             await session.__aenter__()
             await step(session, FRAMES[0])
             token = session.resume_token
-        async with asyncio.timeout(10):
-            while (await client.stream_info("roaming")).attached:  # noqa: ASYNC110
-                await asyncio.sleep(0.01)
+
+        async def is_detached() -> bool:
+            return not (await client.stream_info("roaming")).attached
+
+        await eventually_true(is_detached)
         taken = client.open_session(RIG, stream_id="roaming", resume_token=token)
         async with taken as again:
             assert (await step(again, FRAMES[1])).origin is Origin.RESUMED

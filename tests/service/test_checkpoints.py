@@ -1,4 +1,4 @@
-"""What a sequence goes on from: exact where it is whole, and done again where it is not."""
+"""A sequence continues from its checkpoint, to the bit, or starts again if it is damaged."""
 
 import asyncio
 from collections.abc import Callable, Sequence
@@ -15,22 +15,23 @@ from tests.support.polling import eventually
 from tests.support.sequences import make_frames, write_sequence
 from tests.support.server import running_server
 from vergence_proto.accuracy import Accuracy
-from vergence_service.inference.model import Step, StepResult, View
+from vergence_service.inference.model import Step, StepResult, StereoView
 from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
 from vergence_service.inference.snapshots import BadSnapshot, state_from_bytes, state_to_bytes
 from vergence_service.jobs.checkpoints import read_checkpoint, write_checkpoint
 from vergence_service.jobs.job import Job, JobOptions
+from vergence_service.jobs.progress import JobProgress
 from vergence_service.jobs.results import read_frames
-from vergence_service.jobs.run import Progress, run_job
+from vergence_service.jobs.run import run_job
 
 FRAMES = 24
 
 
-def view_of(frame_id: int, *, posed: bool = True) -> View:
+def make_view(frame_id: int, *, posed: bool = True) -> StereoView:
     frame = make_frame(frame_id, brightness=40 + frame_id)
     assert frame.pose is not None
     pose = frame.pose.world_from_left if posed else None
-    return View(frame.left, frame.right, RIG, frame.capture_ns, pose)
+    return StereoView(frame.left, frame.right, RIG, frame.capture_ns, pose)
 
 
 @pytest.fixture(scope="module")
@@ -41,10 +42,10 @@ def model() -> OnnxStereoModel:
 
 
 def test_a_step_on_a_state_that_was_bytes_is_the_same_to_the_bit(model: OnnxStereoModel) -> None:
-    [first] = model.step([Step(view_of(1), None, 1)])
-    [expected] = model.step([Step(view_of(2), first.state, 1)])
+    [first] = model.step([Step(make_view(1), None, 1)])
+    [expected] = model.step([Step(make_view(2), first.state, 1)])
     restored = state_from_bytes(state_to_bytes(first.state))
-    [result] = model.step([Step(view_of(2), restored, 1)])
+    [result] = model.step([Step(make_view(2), restored, 1)])
     np.testing.assert_array_equal(result.offset_px, expected.offset_px)
     for tensor, same in zip(result.state.tensors, expected.state.tensors, strict=True):
         np.testing.assert_array_equal(tensor, same)
@@ -53,12 +54,12 @@ def test_a_step_on_a_state_that_was_bytes_is_the_same_to_the_bit(model: OnnxSter
 
 
 def test_a_state_without_a_pose_comes_back_without_one() -> None:
-    [result] = RecallModel().step([Step(view_of(1, posed=False), None, 1)])
+    [result] = RecallModel().step([Step(make_view(1, posed=False), None, 1)])
     assert state_from_bytes(state_to_bytes(result.state)).world_from_left is None
 
 
 def test_bytes_that_are_no_state_are_refused() -> None:
-    [result] = RecallModel().step([Step(view_of(1), None, 1)])
+    [result] = RecallModel().step([Step(make_view(1), None, 1)])
     whole = state_to_bytes(result.state)
     flipped = bytearray(whole)
     flipped[len(whole) // 2] ^= 1
@@ -68,7 +69,7 @@ def test_bytes_that_are_no_state_are_refused() -> None:
 
 
 class StopsAfter(RecallModel):
-    """Takes so many steps, and stays in the next one until it is let go."""
+    """A model that takes so many steps, and stays in the next until ``let_go``."""
 
     def __init__(self, count: int) -> None:
         super().__init__()
@@ -93,15 +94,15 @@ def make_job(folder: Path, *, metrics: bool = False) -> Job:
     )
 
 
-async def run(model: RecallModel, folder: Path, job: Job) -> tuple[Progress, Accuracy | None]:
-    progress = Progress()
+async def run(model: RecallModel, folder: Path, job: Job) -> tuple[JobProgress, Accuracy | None]:
+    progress = JobProgress()
     async with running_server(model) as server:
         found = await run_job(server.engine, folder, job, progress, checkpoint_s=1e-9)
     return progress, found
 
 
 async def run_to_the_middle(folder: Path, job: Job) -> None:
-    model, progress = StopsAfter(FRAMES // 2), Progress()
+    model, progress = StopsAfter(FRAMES // 2), JobProgress()
     async with running_server(model) as server:
         work = asyncio.create_task(run_job(server.engine, folder, job, progress, checkpoint_s=1e-9))
         # Not before the model has stopped: nobody would let it go.
@@ -117,7 +118,7 @@ def maps_in(folder: Path) -> list[NDArray[np.float32]]:
     return [frame.offset_px for frame in read_frames(folder / "result")]
 
 
-async def test_a_sequence_goes_on_from_its_checkpoint_to_the_bit(tmp_path: Path) -> None:
+async def test_a_sequence_continues_from_its_checkpoint_to_the_bit(tmp_path: Path) -> None:
     job = make_job(tmp_path / "halved", metrics=True)
     await run_to_the_middle(tmp_path / "halved", job)
     checkpoint = read_checkpoint(tmp_path / "halved" / "checkpoint")
@@ -152,7 +153,7 @@ def with_a_result_lost(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("spoil", [truncated, of_other_weights, with_a_result_lost])
-async def test_what_cannot_be_gone_on_from_is_done_again(
+async def test_a_sequence_without_a_usable_checkpoint_is_done_again(
     tmp_path: Path, spoil: Callable[[Path], None]
 ) -> None:
     job = make_job(tmp_path)

@@ -1,4 +1,4 @@
-"""What waits between Zenoh's threads and the event loop, and what gives way."""
+"""The inbox between Zenoh's threads and the event loop: its order, its room, its drops."""
 
 from collections.abc import AsyncIterator
 

@@ -1,4 +1,4 @@
-"""What the Zenoh network sees of a server: keys, encodings, answers to clients not of ours."""
+"""The server as seen from the Zenoh network: keys, encodings, answers to foreign clients."""
 
 import sys
 from collections.abc import AsyncIterator
@@ -30,7 +30,7 @@ KEYS = StreamKeys(NAMESPACE, "s")
 
 
 class Client:
-    """A client of its own making, message by message."""
+    """A client without the SDK, message by message."""
 
     def __init__(self, peer: ZenohSession) -> None:
         self.peer = peer
@@ -151,13 +151,13 @@ async def test_what_an_earlier_attachment_left_on_the_way_is_passed_over() -> No
 
 async def test_a_lossless_client_that_breaks_its_credit_is_ended() -> None:
     model = RecallModel()
-    async with served(model, grpc__credit=2, grpc__waiting_frames=1) as client:
+    async with served(model, streams__credit=2, streams__waiting_frames=1) as client:
         await client.open(every=True)
         with model.busy():
             for frame_id in range(1, 41):
                 await client.send_frame(frame_id)
         answered = []
-        # A frame that the network lost is told of between the answers.
+        # A frame that the network lost is reported between the answers.
         while not isinstance(answer := await client.inbox.take(), status_pb2.Status):
             if isinstance(answer, pb.DisparityMap):
                 answered.append(answer.frame_id)

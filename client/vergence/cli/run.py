@@ -21,7 +21,7 @@ from vergence.cli.streaming import AnsweredFrame, every_frame, live_frames
 from vergence.client import DepthClient
 from vergence.session import DepthSession
 from vergence_proto.accuracy import Accuracy
-from vergence_proto.datasets import LayoutError, StereoSource, read_ahead, write_disparity_png
+from vergence_proto.datasets import DatasetError, StereoSource, read_ahead, write_disparity_png
 from vergence_proto.ordered import in_order
 from vergence_proto.types import Delivery
 
@@ -60,7 +60,7 @@ async def run(
         results = _Results(directory, alone=alone, kept=shown_in_sheet(len(source)))
         try:
             report = await _stream(session, source, rate_hz, results, console)
-        except LayoutError as error:  # a file in the middle of the sequence
+        except DatasetError as error:  # a file in the middle of the sequence
             raise CliError(str(error), exit_code=2) from None
     if pictures and results.rows:
         write_sheet(directory / "sheet.png", title, results.rows)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vergence.cli.errors import CliError
-from vergence_proto.datasets import LAYOUTS, LayoutError, find_sources
+from vergence_proto.datasets import DATASETS, DatasetError, find_sources
 
 _ARCHIVES = (".zip", ".tar", ".tar.gz", ".tgz", ".tar.xz", ".txz", ".tar.bz2", ".tbz2")
 _OWN_LAYOUT = "vergence"
@@ -60,7 +60,7 @@ def _at(path: Path) -> Iterator[Upload]:
         return
     others = [(kind, each) for kind in DATASETS for each in _found(kind, path)]
     if not others:
-        raise CliError(f"{path}: no sequence in {', '.join(LAYOUTS)} layout", exit_code=2)
+        raise CliError(f"{path}: no sequence in {', '.join(DATASETS)} layout", exit_code=2)
     if len(others) > 1:
         named = ", ".join(f"{kind}:{each}" for kind, each in others[:8])
         raise CliError(
@@ -73,7 +73,7 @@ def _at(path: Path) -> Iterator[Upload]:
 def _found(kind: str, path: Path) -> list[Path]:
     try:
         specs = find_sources(f"{kind}:{path}")
-    except LayoutError as error:
+    except DatasetError as error:
         raise CliError(str(error), exit_code=2) from None
     return [Path(spec.partition(":")[2]) for spec in specs]
 

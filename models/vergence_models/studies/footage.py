@@ -102,6 +102,6 @@ def rendered(
 
 
 def group_on_disk(spec: str, frames: int) -> FootageGroup:
-    """Every source under KIND:PATH. Raises LayoutError as it is read."""
+    """Every source under KIND:PATH. Raises DatasetError as it is read."""
     words = f"at most {frames} frames of each sequence in `{spec}`"
     return FootageGroup(spec, words, frames, lambda: footage_on_disk(find_sources(spec)))
