@@ -34,7 +34,7 @@ def main() -> None:
         for made in generate(Path(fresh)):
             committed = (ROOT / PROTO).parent / made.name
             if not committed.exists() or committed.read_bytes() != made.read_bytes():
-                raise SystemExit(f"{committed} is not what {PROTO} gives; run {__file__}")
+                raise SystemExit(f"{committed} differs from what {PROTO} generates; run {__file__}")
 
 
 if __name__ == "__main__":

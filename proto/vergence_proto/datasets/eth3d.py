@@ -9,7 +9,10 @@ from pathlib import Path
 from vergence_proto.datasets import middlebury
 from vergence_proto.datasets.source import StereoSource
 
-find = middlebury.find
+
+def find(root: Path) -> list[Path]:
+    """List every scene in or under ``root``."""
+    return middlebury.find(root)
 
 
 def open_path(path: Path) -> StereoSource:

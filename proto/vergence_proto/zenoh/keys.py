@@ -54,9 +54,9 @@ class StreamKeys:
 
     def __init__(self, namespace: str, stream_id: str) -> None:
         self._stream = f"{namespace}/v1/{stream_id}"
-        self.frames = f"{self._stream}/frames"
-        self.disparity = f"{self._stream}/disparity"
-        self.status = f"{self._stream}/status"
+        self.frames: str = f"{self._stream}/frames"
+        self.disparity: str = f"{self._stream}/disparity"
+        self.status: str = f"{self._stream}/status"
 
     def client(self, attachment_id: str) -> str:
         """Return the key of the token that shows that this attachment is alive."""

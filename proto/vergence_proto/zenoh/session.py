@@ -104,7 +104,7 @@ class ZenohSession:
         except BaseException:
             self._threads.shutdown(wait=False)
             raise
-        self.id = str(self._session.zid())
+        self.id: str = str(self._session.zid())
 
     async def close(self) -> None:
         """Close the session, and with it everything that it declared."""
