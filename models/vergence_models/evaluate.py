@@ -157,9 +157,9 @@ def draw_plots(results: Results, folder: Path) -> None:
             epes = accumulator.epe_by_frame()
             start.plot(range(1, len(epes) + 1), epes, label=name, marker="." * (len(epes) < 2))
             summary = accumulator.summary()
-            told = [summary[f"within_{s}"] for s in SHARES_PCT if f"within_{s}" in summary]
-            if told:
-                trust.plot(SHARES_PCT, told, marker=".", label=name)
+            reported = [summary[f"within_{s}"] for s in SHARES_PCT if f"within_{s}" in summary]
+            if reported:
+                trust.plot(SHARES_PCT, reported, marker=".", label=name)
         start.set(xlabel="frame", ylabel="EPE [px]", title=group, ylim=(0, None))
         start.legend(fontsize="small")
         trust.plot((0, 100), (0, 100), color="0.7", linestyle=":")
