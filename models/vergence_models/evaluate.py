@@ -65,7 +65,7 @@ def footage_on_disk(sources: list[str]) -> Iterator[Footage]:
 
 
 def footage_of_pool(folder: Path, clips: int) -> Iterator[Footage]:
-    """The first clips of a pool, as a camera films them. Raises FileNotFoundError."""
+    """The first clips of a pool, with camera flaws. Raises FileNotFoundError."""
     pool = ClipPool(folder)
     for index in range(min(clips, len(pool))):
         clip = filmed(pool, range(index, index + 1))
@@ -111,7 +111,7 @@ COLUMNS = {
 
 
 def figures(accumulator: MetricAccumulator) -> dict[str, float]:
-    """The summary, and from which frame on a start has settled."""
+    """The summary, and the frame by which a start has settled."""
     settled = settled_frame(accumulator.epe_by_frame())
     return accumulator.summary() | ({} if settled is None else {"settled": settled})
 
@@ -144,7 +144,7 @@ def as_json(results: Results) -> dict[str, object]:
 
 
 def draw_plots(results: Results, folder: Path) -> None:
-    """One PNG per group: EPE against the frame's number, and how far sigma keeps its word."""
+    """One PNG per group: EPE against the frame's number, and the calibration of sigma."""
     import matplotlib as mpl
 
     mpl.use("Agg")

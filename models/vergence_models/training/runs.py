@@ -32,7 +32,7 @@ SHARDED_FORMAT = 2  # an index, and the large tensors beside it
 
 
 class RunError(ValueError):
-    """A run's folder lacks its checkpoint, or holds one of another format or configuration."""
+    """A run's folder has no checkpoint, or one of another format or configuration."""
 
 
 @dataclass(slots=True)

@@ -31,7 +31,7 @@ TAPS = 2 * REACH + 1
 
 
 def near_columns(max_disparity_px: int) -> Near:
-    """The columns of the right image that the fine search meets."""
+    """The columns of the right image that the fine search reads."""
     return Near(ratio=4 // FINE_PX, reach=max_disparity_px // FINE_PX, margin=REACH + 2)
 
 
