@@ -148,5 +148,5 @@ def test_a_beginning_that_depends_on_the_count_is_refused() -> None:
         each for each in models[StepKind(3)].graph.initializer if each.name == "begin_1.weight"
     )
     weight.CopyFrom(numpy_helper.from_array(np.array([8.0], np.float32), "begin_1.weight"))
-    with pytest.raises(StageError, match=r"tiny_begin_1\.onnx: is another in tiny_3 than"):
+    with pytest.raises(StageError, match=r"tiny_begin_1\.onnx: tiny_3 needs another graph than"):
         in_stages("tiny", models, handed_on(parts()))
