@@ -65,7 +65,7 @@ def footage_on_disk(sources: list[str]) -> Iterator[Footage]:
 
 
 def footage_of_pool(folder: Path, clips: int) -> Iterator[Footage]:
-    """The first clips of a pool, as a camera films them. Raises FileNotFoundError."""
+    """The first clips of a pool, with camera flaws. Raises FileNotFoundError."""
     pool = ClipPool(folder)
     for index in range(min(clips, len(pool))):
         clip = filmed(pool, range(index, index + 1))
@@ -111,7 +111,7 @@ COLUMNS = {
 
 
 def figures(accumulator: MetricAccumulator) -> dict[str, float]:
-    """The summary, and from which frame on a start has settled."""
+    """The summary, and the frame by which a start has settled."""
     settled = settled_frame(accumulator.epe_by_frame())
     return accumulator.summary() | ({} if settled is None else {"settled": settled})
 
@@ -144,7 +144,7 @@ def as_json(results: Results) -> dict[str, object]:
 
 
 def draw_plots(results: Results, folder: Path) -> None:
-    """One PNG per group: EPE against the frame's number, and how far sigma keeps its word."""
+    """One PNG per group: EPE against the frame's number, and the calibration of sigma."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -157,9 +157,9 @@ def draw_plots(results: Results, folder: Path) -> None:
             epes = accumulator.epe_by_frame()
             start.plot(range(1, len(epes) + 1), epes, label=name, marker="." * (len(epes) < 2))
             summary = accumulator.summary()
-            told = [summary[f"within_{s}"] for s in SHARES_PCT if f"within_{s}" in summary]
-            if told:
-                trust.plot(SHARES_PCT, told, marker=".", label=name)
+            reported = [summary[f"within_{s}"] for s in SHARES_PCT if f"within_{s}" in summary]
+            if reported:
+                trust.plot(SHARES_PCT, reported, marker=".", label=name)
         start.set(xlabel="frame", ylabel="EPE [px]", title=group, ylim=(0, None))
         start.legend(fontsize="small")
         trust.plot((0, 100), (0, 100), color="0.7", linestyle=":")

@@ -176,8 +176,8 @@ def write_model(
         {str(kind.iterations): each for kind, each in stages.items() if bool(kind.at_2x) == cold}
         for cold in (False, True)
     )
-    told = {**entry, "graphs": graphs, "cold_graphs": cold_graphs, "files": digests}
-    write_entry(out / MANIFEST_NAME, name, told)
+    complete = {**entry, "graphs": graphs, "cold_graphs": cold_graphs, "files": digests}
+    write_entry(out / MANIFEST_NAME, name, complete)
 
 
 def exported_parts(network: AnyNetwork) -> StepParts[ModelProto]:

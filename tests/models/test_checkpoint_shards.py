@@ -1,4 +1,4 @@
-"""Laws of large checkpoints: pieces small enough to travel, and a run that goes on from them."""
+"""Laws of large checkpoints: shards below 16 MiB, and a run that continues from them."""
 
 from __future__ import annotations
 

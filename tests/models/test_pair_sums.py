@@ -62,7 +62,7 @@ def packed_orders(weights: Array, seed: int) -> Iterator[Array]:
 
 
 def saturates(weights: Array, seed: int = 0) -> bool:
-    """Whether some bytes and some order of int8 weights [O, K] give a wrong sum."""
+    """True if some bytes and some order of int8 weights [O, K] lead to a wrong sum."""
     return any(
         not np.array_equal(
             added_in_pairs(

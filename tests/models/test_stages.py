@@ -82,7 +82,7 @@ def parts() -> StepParts[ModelProto]:
 
 
 def computed(kind: StepKind, left: Array, right: Array, state: Array) -> Array:
-    """What :func:`parts` say, in numpy."""
+    """The result of :func:`parts`, in numpy."""
 
     def iterated(left: Array, right: Array, state: Array, count: int) -> Array:
         for _ in range(count):
@@ -134,7 +134,7 @@ def test_a_graph_holds_only_its_own() -> None:
     assert kept["tiny_begin_0.onnx"] == {"begin_0.weight"}
     assert kept["tiny_begin_1.onnx"] == {"begin_1.weight"}
     assert kept["tiny_3.onnx"] == {"iterate.weight", "end.weight"}
-    # A closer look begins anew, and where its state lies is not computed again.
+    # 2x refinement runs the first part again, but does not warp its state.
     at_2x = {f"closer_begin_{number}.{name}" for number, name in enumerate(("near", "far"))}
     made = {name for each in files["tiny_3_cold.onnx"].graph.node for name in each.output}
     assert at_2x < made
@@ -148,5 +148,5 @@ def test_a_beginning_that_depends_on_the_count_is_refused() -> None:
         each for each in models[StepKind(3)].graph.initializer if each.name == "begin_1.weight"
     )
     weight.CopyFrom(numpy_helper.from_array(np.array([8.0], np.float32), "begin_1.weight"))
-    with pytest.raises(StageError, match=r"tiny_begin_1\.onnx: is another in tiny_3 than"):
+    with pytest.raises(StageError, match=r"tiny_begin_1\.onnx: tiny_3 needs another graph than"):
         in_stages("tiny", models, handed_on(parts()))

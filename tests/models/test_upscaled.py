@@ -1,4 +1,4 @@
-"""Laws of the closer look: what is larger comes back as it was, and the surer of two is kept."""
+"""Laws of 2x refinement: downsampling restores a state, and the surer of two results is kept."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_each_pixel_keeps_one_of_two_and_the_state_agrees(seed: int) -> None:
     assert hidden.shape == (1, 3, HEIGHT // 8, WIDTH // 8)
 
 
-def test_a_cold_step_without_a_closer_look_is_any_first_step() -> None:
+def test_a_cold_step_without_2x_refinement_is_any_first_step() -> None:
     torch.manual_seed(5)
     network = LiteNetwork(LiteNetworkConfig()).eval()
     left, right = torch.randint(0, 255, (2, 1, 192, 256, 3), dtype=torch.uint8)
@@ -97,14 +97,14 @@ def test_a_cold_step_without_a_closer_look_is_any_first_step() -> None:
     assert [each.shape for each in at_2x.state] == [each.shape for each in cold.state]
 
 
-def test_a_tier_without_a_closer_look_says_so() -> None:
+def test_a_tier_without_2x_refinement_says_so() -> None:
     network = RaftNetwork(FAST_NETWORK).eval()
     image = torch.zeros(1, 192, 256, 3, dtype=torch.uint8)
     with pytest.raises(ValueError, match="RaftNetwork cannot refine at 2x, got 1 iterations"):
         network.cold_step(image, image, 2, at_2x=1)
 
 
-def test_a_closer_look_finds_bars_that_are_thinner_than_a_cell() -> None:
+def test_2x_refinement_finds_bars_that_are_thinner_than_a_cell() -> None:
     wall_px, bar_px, width = 6, 16, 3
     random = np.random.default_rng(11)
     left, right = (np.zeros((192, 256, 3), np.uint8) for _ in range(2))

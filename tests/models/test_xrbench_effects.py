@@ -1,4 +1,4 @@
-"""What the final pass's camera does, against the clean one's pictures."""
+"""Laws of the final pass's camera, against the pictures of the clean pass."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_a_band_is_the_same_rows_of_the_whole_image() -> None:
 
 @pytest.mark.parametrize("axis", [0, 1], ids=["down", "right"])
 def test_the_focus_stays_where_it_is_through_every_point_of_the_lens(axis: int) -> None:
-    """What is not in focus moves by focal length x lens point x difference of inverse depths."""
+    """A point out of focus moves by focal length x lens point x difference of inverse depths."""
     point_m = (0.1, 0.0) if axis == 1 else (0.0, 0.1)
     pinhole = traced(board()).albedo
 

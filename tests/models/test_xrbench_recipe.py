@@ -34,7 +34,7 @@ TINY = Recipe("studio", frames=1, width=32, height=24, samples=4, fps=20, baseli
 
 @pytest.fixture(scope="module")
 def camera() -> StereoCamera:
-    """What films TINY, however many frames of it."""
+    """A camera that films TINY, for any number of frames."""
     return StereoCamera(TINY, variant="scalar_rgb")
 
 

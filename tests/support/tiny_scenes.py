@@ -1,4 +1,4 @@
-"""Tiny scenes on film, and where their pixels go: for tests of the synthetic stereo video."""
+"""Tiny rendered scenes and the motion of their pixels, for tests of the synthetic video."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ PAINT = Material(texture=0, span_m=1.0)
 
 
 def reprojected(clips: StereoClips, index: int, frame: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Where the pixels of a frame lie in the next one: u, v and disparity there, each [H, W]."""
+    """The places of a frame's pixels in the next one: u, v and disparity there, each [H, W]."""
     fx, fy, cx, cy, baseline_m = (
         float(getattr(clips, name)[index]) for name in ("fx", "fy", "cx", "cy", "baseline_m")
     )

@@ -205,7 +205,7 @@ def _nearest_of(primitives: Primitives, candidates: Tensor, x: Tensor, y: Tensor
 
 def _develop(color: Tensor, shots: list[Shot]) -> Tensor:
     """Linear RGB [B, V, H, W, 3] to uint8: one exposure a clip, a soft shoulder, gamma."""
-    # Of the last left view: clips that end with the same view show it alike (see shots.Playback).
+    # The last left view sets it: clips that end with one view show it alike (see shots.Playback).
     brightness = color[:, -2:-1].mean(dim=(1, 2, 3, 4)).clamp(min=1e-3)
     aim = column([s.scene.exposure for s in shots], color.device)
     exposed = color * (aim / brightness)[:, None, None, None, None]

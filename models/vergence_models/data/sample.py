@@ -32,7 +32,7 @@ from vergence_models.data.views import Shot
 _RATE_HZ = 30
 _BASELINE_M = 0.1
 _FOCAL_PER_WIDTH = 0.625  # 77 degrees across
-_NOISE = 1.0  # standard deviation, grey levels
+_NOISE = 1.0  # standard deviation of the sensor noise, grey levels
 
 
 def living_room(kinds: tuple[str, ...]) -> Scene:

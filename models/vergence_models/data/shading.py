@@ -17,7 +17,7 @@ from vergence_models.data.textures import TextureBank
 
 _CHUNK = 16384
 _MAX_ANISOTROPY = 6.0
-_SHADOW_BIAS = 0.008  # of the distance to the light
+_SHADOW_BIAS = 0.008  # share of the distance to the light
 _SHADOW_LIFT = 0.015  # likewise, along the surface's normal
 FACES = 8  # surface index = primitive * FACES + face
 

@@ -43,7 +43,7 @@ def draw_shot(
 ) -> Shot:  # fmt: skip
     """Draw everything about one clip. `kinds` names the textures of the bank that renders it.
 
-    The camera's speed is drawn too, unless `playback` sets it; moving things keep their own.
+    The camera's speed is random too, unless `playback` sets it; moving objects keep their own.
     """
     mix = mix or Mix()
     palette = MaterialPalette(rng, kinds)

@@ -85,13 +85,13 @@ def with_pose_noise(footage: Footage, *, deg: float, m: float) -> Footage:
         return footage
     known = [pose for pose in poses if pose is not None]
     random = np.random.default_rng(zlib.crc32(footage.name.encode()))
-    told = known[:1]
+    noisy = known[:1]
     for before, now in itertools.pairwise(known):
         axis, direction = (v / np.linalg.norm(v) for v in random.standard_normal((2, 3)))
         curr_from_true = Pose(rotation(axis * np.radians(deg)), direction * m)
         prev_from_curr = before.inverse() @ now
-        told.append(told[-1] @ prev_from_curr @ curr_from_true.inverse())
+        noisy.append(noisy[-1] @ prev_from_curr @ curr_from_true.inverse())
     views = [
-        replace(view, world_from_left=pose) for view, pose in zip(footage.views, told, strict=True)
+        replace(view, world_from_left=pose) for view, pose in zip(footage.views, noisy, strict=True)
     ]
     return replace(footage, views=views)

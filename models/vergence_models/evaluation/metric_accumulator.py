@@ -48,8 +48,8 @@ class MetricAccumulator:
         self.frames.append(measures)
         self.by_index.setdefault(index, []).append(measures["epe"])
         if prediction.sigma_px is not None:
-            told = calibration(prediction.disparity_px, prediction.sigma_px, view.truth_px)
-            self.calibrations += [told] if told else []
+            calibrated = calibration(prediction.disparity_px, prediction.sigma_px, view.truth_px)
+            self.calibrations += [calibrated] if calibrated else []
 
     def _follow(
         self,

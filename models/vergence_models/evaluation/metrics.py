@@ -15,8 +15,8 @@ from vergence_proto.geometry import Pose, RectifiedRig
 
 Plane = NDArray[np.float32]
 
-MIN_PIXELS = 20  # fewer known pixels say nothing about a frame
-SHARES_PCT = range(10, 100, 10)  # the intervals that sigma is judged by
+MIN_PIXELS = 20  # a frame with fewer known pixels has no figures
+SHARES_PCT = range(10, 100, 10)  # the intervals in which the calibration of sigma is measured
 
 
 def error_measures(predicted_px: Plane, truth_px: Plane) -> dict[str, float] | None:

@@ -1,4 +1,4 @@
-"""A training run stepped over footage, where no graph of it was exported."""
+"""A training run stepped over footage by PyTorch, for counts without an exported graph."""
 
 from __future__ import annotations
 

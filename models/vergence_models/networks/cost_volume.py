@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-BLOCKS = 8  # of columns: images are as wide as multiples of 32, so cells of 1/4 divide into them
+BLOCKS = 8  # blocks of columns: widths are multiples of 32, so cells of 1/4 divide into them
 
 
 class Volume(NamedTuple):
@@ -67,7 +67,7 @@ class Near(NamedTuple):
         start = torch.arange(BLOCKS, device=left.device) * block - self.before
         cells = torch.arange(self.before + block + self.after, device=left.device)
         cells = (cells + start[:, None]).clamp(0, width - 1)
-        # Of the mean the division first: what follows then only copies, which bytes can be.
+        # The mean's division comes first: all operators after it copy, which works on bytes too.
         left_rows = (left * (1 / channels)).permute(0, 2, 1, 3)
         left_rows = left_rows.reshape(batch, height, channels, BLOCKS, block).transpose(2, 3)
         right_rows = right.permute(0, 2, 3, 1).reshape(batch, height, width, ratio * channels)
@@ -121,7 +121,7 @@ def gathered(volume: Volume, entry: Tensor) -> Tensor:
     # Row by row, so that a row is still in the cache when its next entry is read.
     by_row = (entry.transpose(1, 2) - volume.first).clamp(0, volume.window - 1)
     by_row = by_row * volume.stride + volume.begin
-    # Of single entries onnxruntime's gather of elements is four times as quick as that of slices.
+    # For single entries onnxruntime's GatherElements is four times as fast as its Gather of slices.
     rows = volume.scores.reshape(batch * height, -1)
     found = rows.gather(1, by_row.long().reshape(batch * height, -1))
     return found.view(by_row.shape).transpose(1, 2)

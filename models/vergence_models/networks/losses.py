@@ -56,7 +56,7 @@ def doubt_loss(error_px: Tensor, sigma_px: Tensor) -> Tensor:
 def output_loss(
     disparity: Tensor, sigma: Tensor, truth_px: Tensor, max_disparity_px: int
 ) -> Tensor:
-    """The loss of an answer against ``truth_px``, all [B, H, W]; 0 = unknown truth."""
+    """The loss of disparity and sigma against ``truth_px``, all [B, H, W]; 0 = unknown truth."""
     mask = known(truth_px, max_disparity_px)
     error = (disparity - truth_px).abs()
     # Sigma learns from the error, and must not buy itself a better one.

@@ -67,9 +67,9 @@ def _patches(
     image: Array, node: NodeProto, size: tuple[int, ...], draw: np.random.Generator
 ) -> Reals:
     """Patches of [B, C, H, W] at random places: [PATCHES, C * height * width]."""
-    told = {entry.name: list(entry.ints) for entry in node.attribute}
-    top, left, bottom, right = told.get("pads", [0, 0, 0, 0])
-    down, across = told.get("strides", [1, 1])
+    attributes = {entry.name: list(entry.ints) for entry in node.attribute}
+    top, left, bottom, right = attributes.get("pads", [0, 0, 0, 0])
+    down, across = attributes.get("strides", [1, 1])
     padded = np.pad(image, ((0, 0), (0, 0), (top, bottom), (left, right)))
     windows = np.lib.stride_tricks.sliding_window_view(padded, size, axis=(2, 3))
     windows = windows[:, :, ::down, ::across]

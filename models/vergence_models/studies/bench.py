@@ -19,7 +19,7 @@ from vergence_proto.geometry import RectifiedRig
 
 
 class Bench:
-    """The networks, the clips, and what is known of them so far."""
+    """The networks, the clips, and the figures measured so far."""
 
     def __init__(
         self,
@@ -39,11 +39,11 @@ class Bench:
         self._accumulators: dict[tuple[str, str], MetricAccumulator] = {}
 
     def clips(self) -> FootageGroup:
-        """The held-out clips as a calm head films them, rendered if need be."""
+        """The held-out clips with calm head motion; renders them at the first call."""
         return self._group(None)
 
     def clips_at(self, speed: int) -> FootageGroup:
-        """Shorter ones of the same scenes at a speed, judged by their last frame."""
+        """Shorter clips of the same scenes at a speed, measured on their last frame."""
         return self._group(speed)
 
     def _group(self, speed: int | None) -> FootageGroup:
@@ -101,7 +101,7 @@ def step_times_ms(
 
 
 def textured_footage(width: int, height: int, frames: int) -> Footage:
-    """A still view of noise at four scales, all at a disparity of 16 px: something to time on."""
+    """A still view of noise at four scales, at a disparity of 16 px, for measuring times."""
     random = np.random.default_rng(0)
     wide = np.zeros((height, width + 16, 3), np.float32)
     for scale in (2, 8, 32, 128):

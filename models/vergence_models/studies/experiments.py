@@ -27,7 +27,7 @@ from vergence_models.studies.learning import learning_curves
 from vergence_models.studies.networks import StudiedNetwork
 from vergence_models.studies.tables import EPE_COLUMNS, TIME_COLUMNS, Curve, Table, TableRow
 
-NOISE_DEG, NOISE_M = 0.3, 0.001  # of one level
+NOISE_DEG, NOISE_M = 0.3, 0.001  # pose errors at noise level 1
 REPORTED_FRAMES = (1, 2, 3, 5, 10, 15, 20, 30)
 WARP_SPEEDS = (1, 6)
 
@@ -52,7 +52,7 @@ def one_iteration(bench: Bench) -> list[tuple[StudiedNetwork, Method]]:
 
 
 def training_of(networks: Sequence[StudiedNetwork]) -> list[str]:
-    """Of those that have a row; a run whose every count is a graph too has none."""
+    """The training of all networks with a row; a run whose counts all have graphs has none."""
     return [each.training.words for each in networks if each.warm or each.single_frame]
 
 
@@ -114,7 +114,7 @@ def warp_ablation(bench: Bench) -> Table:
         name="warp",
         title="Warp or no warp, at 1x and 6x",
         text=f"EPE in px on {bench.clips_at(1).words}; one warm iteration a frame. *Not moved*: "
-        "the same weights are told that the camera stands still, which leaves the state in place. "
+        "the same weights see no camera motion, which leaves the state in place. "
         "*No state*: every frame cold.",
         columns={"1x": "1x", "6x": "6x", "loss": "loss at 6x, %"},
         rows=[
@@ -168,9 +168,9 @@ def pose_noise(bench: Bench, levels: Sequence[int] = range(11)) -> Table:
     for studied, warm in one_iteration(bench):
         if not studied.warps:
             continue
-        told = {level: with_noise_level(warm, level) for level in levels}
-        found = bench.accumulators(bench.clips_at(1), list(told.values()))
-        cells[warm.label] = {str(k): epe(found[method.label]) for k, method in told.items()}
+        reported = {level: with_noise_level(warm, level) for level in levels}
+        found = bench.accumulators(bench.clips_at(1), list(reported.values()))
+        cells[warm.label] = {str(k): epe(found[method.label]) for k, method in reported.items()}
     return Table(
         name="noise",
         title="Noise of the poses, levels 0 to 10",
@@ -209,10 +209,10 @@ def cold_start(bench: Bench) -> Table:
     group = bench.clips()
     found = bench.accumulators(group, methods)
     curves = {label: accumulator.epe_by_frame() for label, accumulator in found.items()}
-    told = [frame for frame in REPORTED_FRAMES if frame <= group.frames]
+    reported = [frame for frame in REPORTED_FRAMES if frame <= group.frames]
     rows = []
     for label, epes in curves.items():
-        values = {str(frame): epes[frame - 1] for frame in told if frame <= len(epes)}
+        values = {str(frame): epes[frame - 1] for frame in reported if frame <= len(epes)}
         settled = settled_frame(epes)
         rows.append(TableRow(label, values if settled is None else values | {"settled": settled}))
     cold = ", ".join(f"{c.name} {c.cold}" for c, _ in one_iteration(bench))
@@ -222,7 +222,7 @@ def cold_start(bench: Bench) -> Table:
         text=f"EPE in px by the number of the frame, on {group.words}. *Settled*: the first frame "
         "within 10 % of the mean over the later half. Iterations on the first frame, where a row "
         f"does not say: {cold}.",
-        columns={str(frame): str(frame) for frame in told} | {"settled": "settled by"},
+        columns={str(frame): str(frame) for frame in reported} | {"settled": "settled by"},
         rows=rows,
         training=training_of(bench.networks),
         findings=cold_start_findings([row for row in rows if "every frame" not in row.label]),

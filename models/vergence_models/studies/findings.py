@@ -42,7 +42,7 @@ def main_findings(
                 if studied.network.refines_at_2x(count):
                     lines.append(f"{line} (the last ones at 2x, which the paper does not have).")
                     continue
-                limit = 1.05 if count >= 20 else 1.0  # of their RAFT-Stereo at 20 and at 7
+                limit = 1.05 if count >= 20 else 1.0  # relative to the paper's RAFT-Stereo
                 holds = verdict(warm_epe <= limit * alone)
                 lines.append(f"{line}; the paper's shape: at most {limit:.2f}: {holds}.")
     return lines
@@ -59,13 +59,13 @@ def warp_findings(cells: Mapping[str, Mapping[str, float]]) -> list[str]:
     for label, values in cells.items():
         lost = loss_pct(values)
         if label.endswith("state moved"):
-            told = f"the paper's shape: under +20 %: {verdict(lost < 20)}"
+            comparison = f"the paper's shape: under +20 %: {verdict(lost < 20)}"
         elif label.endswith("state not moved"):
             leans = "holds" if lost > 60 else "this network leans less on its past"
-            told = f"the paper's shape: over +60 %: {leans}"
+            comparison = f"the paper's shape: over +60 %: {leans}"
         else:
             continue
-        lines.append(f"{label}: {lost:+.0f} % EPE at 6x; {told}.")
+        lines.append(f"{label}: {lost:+.0f} % EPE at 6x; {comparison}.")
     return lines
 
 

@@ -23,8 +23,8 @@ def learning_curves(bench: Bench) -> Table:
     for studied in runs:
         history = studied.history
         for point in reported_history(history):
-            told = {key: point.measured[key] for key in COLUMNS if key in point.measured}
-            rows.append(TableRow(f"{studied.name}, {point.steps:,} steps", told))
+            reported = {key: point.measured[key] for key in COLUMNS if key in point.measured}
+            rows.append(TableRow(f"{studied.name}, {point.steps:,} steps", reported))
         for kind in ("cold", "warm"):
             steps = [float(point.steps) for point in history]
             epes = [point.measured[f"{kind}_epe"] for point in history]
@@ -47,8 +47,8 @@ def learning_curves(bench: Bench) -> Table:
 
 def reported_history(history: Sequence[Validation]) -> list[Validation]:
     """The first, the last, and those between that doubled the steps of the one before."""
-    told = list(history[:1])
+    reported = list(history[:1])
     for point in history[1:-1]:
-        if point.steps >= 2 * told[-1].steps and 2 * point.steps <= history[-1].steps:
-            told.append(point)
-    return told + list(history[1:][-1:])
+        if point.steps >= 2 * reported[-1].steps and 2 * point.steps <= history[-1].steps:
+            reported.append(point)
+    return reported + list(history[1:][-1:])

@@ -61,7 +61,7 @@ class StudiedNetwork:
     single_frame: tuple[int, ...]
     cold: int  # iterations on the first frame of a warm sequence
     warps: bool  # its state moves with the camera; otherwise poses do not matter to it
-    history: list[Validation] = field(default_factory=list)  # of a run, while it was trained
+    history: list[Validation] = field(default_factory=list)  # validations during a run's training
 
     @property
     def tier(self) -> str:

@@ -32,7 +32,7 @@ SHARDED_FORMAT = 2  # an index, and the large tensors beside it
 
 
 class RunError(ValueError):
-    """A run's folder lacks its checkpoint, or holds one of another format or configuration."""
+    """A run's folder has no checkpoint, or one of another format or configuration."""
 
 
 @dataclass(slots=True)
@@ -173,16 +173,16 @@ def read_history(folder: Path) -> list[Validation]:
 
 
 def load_weights(network: AnyNetwork, weights: Mapping[str, Tensor], source: str) -> None:
-    """Give a network the weights of a run. Raises RunError if they are of another architecture.
+    """Load the weights of a run into a network. Raises RunError if the architecture differs.
 
-    Architectures change while configurations keep their names; nothing but shapes tells.
+    Architectures change while configurations keep their names; only the shapes show it.
     """
     expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
     got = {name: tuple(tensor.shape) for name, tensor in weights.items()}
     for name in sorted(expected | got):
         if expected.get(name) != got.get(name):
             raise RunError(
-                f"{source}: expected weights of today's architecture, these are of another: "
+                f"{source}: expected weights of the present architecture, these are of another: "
                 f"{name} is {got.get(name, 'missing')}, expected {expected.get(name, 'none')}; "
                 "use the version of the project they were trained with"
             )

@@ -23,7 +23,7 @@ START = StepKind(4)  # how the first frame of a clip is stepped
 
 
 def filmed(pool: ClipPool, indices: range) -> StereoClips:
-    """Clips as a camera sees them, the same every time."""
+    """Clips with camera flaws, the same at every call."""
     return film_as_sensor(pool.clips(indices), np.random.default_rng(indices.start))
 
 

@@ -12,7 +12,7 @@ _FLOOR = 0.01  # added to the albedo, so that black can be divided by
 _EDGE = 0.35  # neighbours whose light differs by this factor (in logarithm) are not mixed
 _LIKENESS = 6  # exponent of the cosine between normals: 0.1 for pixels half on either wall
 _DEPTH = 0.02  # relative step in depth that separates surfaces, a pixel
-_BRIGHTEST = 30.0  # of the median: single paths beyond it are fireflies
+_BRIGHTEST = 30.0  # times the median: brighter single paths are fireflies
 
 
 def denoised(light: TracedLight, keep: NDArray[np.bool_] | None = None) -> Planes:

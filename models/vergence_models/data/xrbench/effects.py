@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from vergence_models.data.xrbench.recipe import Effects
 from vergence_models.data.xrbench.tracer import Planes
 
-_FEWEST_STEPS = 6  # of an exposure: enough for the flicker's wave, and points of the lens
+_FEWEST_STEPS = 6  # instants of an exposure: enough for the flicker's wave and points of the lens
 _STEP_PX = 1.5  # images of one exposure that lie closer than this melt into a streak
 # Scattered light: shares, and how far it gets as a share of the image's width.
 _HALOS = ((0.6, 0.008), (0.4, 0.04))

@@ -15,7 +15,7 @@ from vergence_models.data.xrbench.things import Panel, Surface, Thing, Workbench
 # A head sways less than this from where it starts, and still has arm's length to the next thing.
 _CLEARANCE_M = 0.95
 _TRIES = 40
-_THICK_M = 0.1  # of walls
+_THICK_M = 0.1  # thickness of walls
 
 
 class Wall(Enum):

@@ -1,4 +1,4 @@
-"""The head's path through a room."""
+"""The path of the head through a room."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from vergence_models.data.xrbench.meshes import Matrix
 from vergence_models.data.xrbench.recipe import Recipe
 from vergence_models.data.xrbench.things import Room
 
-# The generator's calm head, held back so that it keeps to the clearance around where it starts.
+# The generator's calm head, slowed down so that it stays within the clearance around its start.
 _SWAY = 0.6
 
 

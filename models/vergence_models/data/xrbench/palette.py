@@ -1,4 +1,4 @@
-"""Surfaces drawn at random, by what they are for."""
+"""Random surfaces, by their purpose."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class SurfacePalette:
         self._rng = rng
 
     def plain(self, *, tone: float | None = None, finish: Finish = Finish.MATTE) -> Surface:
-        """Paint of one colour: nothing for a matcher to hold on to."""
+        """Paint of one colour, without any texture to match."""
         level = self._rng.uniform(0.15, 0.8) if tone is None else tone
         return Surface(finish, self._tinted(level, 0.05), self._rng.uniform(0.1, 0.35))
 

@@ -1,4 +1,4 @@
-"""The rooms of the benchmark: what is in each kind, and how it is lit."""
+"""The rooms of the benchmark: the furniture and the light of each kind."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def studio(rng: np.random.Generator, p: SurfacePalette) -> FloorPlan:
 
 
 def playroom(rng: np.random.Generator, p: SurfacePalette) -> FloorPlan:
-    """Things move: a ball rolls, a box spins in the air, a balloon rises."""
+    """Objects move: a ball rolls, a box spins in the air, a balloon rises."""
     plan = living_room(rng, p)
     ball, box, balloon = Workbench(), Workbench(), Workbench()
     ball.add(p.patterned("dots", "plaid", span_m=0.3), meshes.ball((0.14,) * 3))

@@ -101,7 +101,7 @@ def motion(
 
 
 def boxes(hits: FirstHits, room: Room, time_s: float) -> list[Box]:
-    """Of all that is seen, if only by a pixel: the tightest box around it, and its place."""
+    """The tightest box around each thing that at least one pixel sees, and its pose."""
     found: list[Box] = []
     for label in np.unique(hits.label[hits.label > 0]).tolist():
         v, u = np.nonzero(hits.label == label)

@@ -145,7 +145,7 @@ def _words(world_from_camera: Matrix) -> str:
 
 
 def encode_png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
-    """Of grey [H, W] or RGB [H, W, 3]."""
+    """Encode grey [H, W] or RGB [H, W, 3]."""
     turned = image[..., ::-1] if image.ndim == 3 else image
     done, data = cv2.imencode(".png", np.ascontiguousarray(turned))
     assert done, f"OpenCV encodes every image of {image.dtype} {image.shape}"

@@ -27,8 +27,8 @@ REACH = 2  # entries looked up on either side of the current disparity
 TAPS = 2 * REACH + 1
 FILLS = 3  # surfaces that the surroundings suggest: the smooth, the farthest, the nearest one
 HYPOTHESES = 2 + FILLS  # with the current disparity and the best of the scores
-CELL_INPUTS = TAPS + 2 * FILLS + 5  # what the cell sees besides the context
-MIN_PX = 0.1  # no answer is nearer to infinity
+CELL_INPUTS = TAPS + 2 * FILLS + 5  # inputs of the cell besides the context
+MIN_PX = 0.1  # the smallest disparity of a result
 
 
 class CostFeatures(NamedTuple):
@@ -168,14 +168,14 @@ class CoarseUpdate(nn.Module):
         hidden: Tensor,
         d: Tensor,
         *,
-        guess: tuple[Tensor, Tensor],
+        peak: tuple[Tensor, Tensor],
         fills: Tensor,
         hole: Tensor,
         scores: Volume,
         context: Tensor,
     ) -> tuple[Tensor, Tensor, Hypotheses]:
         """Return the next hidden state, the next disparity [B, 1, H, W] px, and the hypotheses."""
-        peak_px, peak_log = guess
+        peak_px, peak_log = peak
         top = scores.scores.amax(dim=-1)[:, None]
         around = lookup_row(scores, coarse_position(d, scores.last), REACH)
         at_fills = lookup(scores, coarse_position(fills, scores.last))

@@ -80,20 +80,20 @@ class Iteration(NamedTuple):
     answer: Refined
     hidden: Tensor  # [B, C, H/8, W/8]
     scores: Tensor  # coarse scores, as in LiteEstimate
-    guesses: tuple[CoarseEstimate, CoarseEstimate]
+    coarse_estimates: tuple[CoarseEstimate, CoarseEstimate]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiteEstimate(Estimate):
-    """The answer, and the guesses on the way to it."""
+    """The estimate, and the inner estimates before it."""
 
     coarse_scores: Tensor  # [B, H/8, W/8, D]: unnormalised log-probability, largest disparity first
-    guesses: list[CoarseEstimate]  # at both scales, of each iteration
+    coarse_estimates: list[CoarseEstimate]  # at both scales, of each iteration
 
     def loss(self, truth_px: Tensor, max_disparity_px: int) -> Tensor:
         """The sum of losses of disparity, sigma, both inner scales and the coarse scores."""
         loss = output_loss(self.disparity, self.sigma, truth_px, max_disparity_px)
-        losses = [guess.loss(truth_px, max_disparity_px) for guess in self.guesses]
+        losses = [each.loss(truth_px, max_disparity_px) for each in self.coarse_estimates]
         loss = loss + 2 / len(losses) * added(losses)
         search = search_cross_entropy(self.coarse_scores, truth_px, max_disparity_px, bin_px=BIN_PX)
         return loss + 0.2 * search
@@ -141,13 +141,13 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         self, matching: MatchingFeatures, state: LiteState, iterations: int
     ) -> tuple[LiteEstimate, LiteState]:
         """The estimate after so many iterations, from a state in the view of this frame."""
-        guesses: list[CoarseEstimate] = []
+        estimates: list[CoarseEstimate] = []
         for _ in range(iterations):
             found = self.iterate(matching, state)
             state = LiteState(found.answer.disparity, found.hidden)
-            guesses += found.guesses
+            estimates += found.coarse_estimates
         disparity, sigma = self.refinement.enlarged(found.answer)
-        return LiteEstimate(disparity, sigma, found.scores, guesses), state
+        return LiteEstimate(disparity, sigma, found.scores, estimates), state
 
     def moved(self, state: LiteState, uvd_curr_from_prev: Tensor) -> LiteState:
         """The state of the previous frame in the view of this one."""
@@ -180,25 +180,25 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         hole8 = (seen8 <= 0).to(prior.dtype)
         prior8 = F.avg_pool2d(prior, 2) / seen8.clamp(min=0.1)
         scores = whole_rows(self.cost_filter(matching.cost_features, matching.context16, prior8))
-        guess = peak(scores)
-        confidence = torch.exp(4 * guess[1])
-        fill = smooth_fill(guess[0], confidence)
+        best = peak(scores)
+        confidence = torch.exp(4 * best[1])
+        fill = smooth_fill(best[0], confidence)
         hidden, d, hypotheses = self.update(
             hidden,
             prior8 + hole8 * (fill - prior8),
-            guess=guess,
-            fills=torch.cat((fill, extremes(guess[0], confidence, fill)), dim=1),
+            peak=best,
+            fills=torch.cat((fill, extremes(best[0], confidence, fill)), dim=1),
             hole=hole8,
             scores=scores,
             context=matching.context8,
         )
         pairs = self.near.volume(matching.pairs)
         answer, chosen_among = self.refinement(pairs, d, hidden, prior, matching.context4)
-        guesses = (
+        estimates = (
             CoarseEstimate(d, hypotheses, 8),
             CoarseEstimate(answer.disparity, chosen_among, 4),
         )
-        return Iteration(answer, hidden, scores.scores, guesses)
+        return Iteration(answer, hidden, scores.scores, estimates)
 
 
 def gray(image: Tensor, scale: int) -> Tensor:

@@ -1,8 +1,8 @@
 """The network of `full` and `fast`, after "Stereo Matching in Time" (Cheng, Yang, Li; WACV 2024).
 
-RAFT-Stereo's realtime network, whose iterations go on over frames: disparity and both hidden states
-of the previous frame are moved to the new view and take one iteration more. Where the warp brings
-nothing, and on a cold start, both start from the context of the new image.
+RAFT-Stereo's realtime network, with iterations that continue over frames: disparity and both hidden
+states of the previous frame are warped to the new view and take one more iteration. Cells without a
+warped state, and cold starts, begin from the context of the new image.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from vergence_models.networks.raft.update import (
 from vergence_models.networks.warp import splat_levels
 from vergence_proto.model_io import StateTensor
 
-MIN_PX = 0.1  # no answer is nearer to infinity
+MIN_PX = 0.1  # the smallest disparity of a result
 TYPICAL_PX = 16.0  # the first disparity of an untrained network
 
 

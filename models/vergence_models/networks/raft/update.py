@@ -15,7 +15,7 @@ from vergence_models.config import RaftNetworkConfig
 from vergence_models.networks.cost_volume import lookup_row, whole_rows
 from vergence_models.networks.layers import all_pairs, silent
 
-CELL_PX = 8  # of the matched features
+CELL_PX = 8  # size of a cell of the matched features
 LEVELS = 4
 REACH = 4  # entries looked up on either side, at every level
 
