@@ -285,7 +285,7 @@ def check_rotation(rotation: Matrix) -> None:
         if error <= _RIGID_TOLERANCE and np.linalg.det(rotation) > 0:
             return
     raise BadPose(
-        f"expected a finite orthonormal rotation [3, 3] of determinant +1, got "
+        f"expected a rotation [3, 3], finite, orthonormal, of determinant +1, got "
         f"{rotation.tolist()}; remove scale and shear, and state left-handed poses by the axes of "
         "the session and not by a mirrored matrix"
     )

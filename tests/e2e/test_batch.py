@@ -61,7 +61,7 @@ async def test_what_was_collected_takes_no_room_on_the_server(tmp_path: Path) ->
         assert (await client.get("/v1/sequences")).json() == []
 
 
-async def test_one_failure_does_not_stop_the_others_and_is_told(tmp_path: Path) -> None:
+async def test_one_failure_does_not_stop_the_others_and_is_reported(tmp_path: Path) -> None:
     dark = make_frames(3)
     dark[1].left[0, 0] = NOT_FINITE
     write_sequence(tmp_path / "dark", dark)
