@@ -1,6 +1,7 @@
 """A sequence continues from its checkpoint, to the bit, or starts again if it is damaged."""
 
 import asyncio
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from tests.support.frames import RIG, make_frame
 from tests.support.models import RecallModel
-from tests.support.polling import eventually
+from tests.support.polling import eventually, turns
 from tests.support.sequences import make_frames, write_sequence
 from tests.support.server import running_server
 from vergence_proto.accuracy import Accuracy
@@ -81,13 +82,13 @@ class StopsAfter(RecallModel):
         return super().step(steps)
 
 
-def make_job(folder: Path, *, metrics: bool = False) -> Job:
-    write_sequence(folder / "input", make_frames(FRAMES))
+def make_job(folder: Path, *, metrics: bool = False, frames: int = FRAMES) -> Job:
+    write_sequence(folder / "input", make_frames(frames))
     options = JobOptions(metrics=metrics)
     return Job(
         job_id="j",
         source="vergence:",
-        frames=FRAMES,
+        frames=frames,
         source_fps=30.0,
         created_s=0.0,
         options=options,
@@ -163,3 +164,31 @@ async def test_a_sequence_without_a_usable_checkpoint_is_done_again(
     progress, _ = await run(model, tmp_path, job)
     assert progress.frames_found == 0
     assert len(model.batches) == len(maps_in(tmp_path)) == FRAMES
+
+
+async def test_no_file_is_written_after_a_run_was_cancelled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    let_go = threading.Event()
+    writing: list[int] = []
+    written: list[int] = []
+
+    def write_slowly(folder: Path, index: int, disparity: object) -> None:
+        writing.append(index)
+        assert let_go.wait(timeout=30)
+        written.append(index)
+
+    monkeypatch.setattr("vergence_service.jobs.run.write_frame", write_slowly)
+    job = make_job(tmp_path, frames=1)
+    async with running_server(RecallModel()) as server:
+        run = asyncio.create_task(
+            run_job(server.engine, tmp_path, job, JobProgress(), checkpoint_s=1e-9)
+        )
+        await eventually(lambda: len(writing) == 1)
+        await turns()
+        run.cancel()
+        await turns()
+        assert not run.done(), "the run ended while a thread was writing"
+        let_go.set()
+        await asyncio.gather(run, return_exceptions=True)
+    assert written == [0]

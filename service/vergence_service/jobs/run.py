@@ -62,14 +62,19 @@ async def run_job(
     checkpoint_due_s = time.monotonic() + checkpoint_s
 
     async def write(stepped: Stepped) -> tuple[Stepped, Accuracy | None]:
-        return stepped, await asyncio.to_thread(_write_and_measure, result, stepped)
+        thread = asyncio.ensure_future(asyncio.to_thread(_write_and_measure, result, stepped))
+        try:
+            return stepped, await asyncio.shield(thread)
+        except asyncio.CancelledError:
+            await asyncio.wait([thread])  # a thread cannot be stopped
+            raise
 
     config = job_stream_config(sequence, job.options)
     try:
         async with (
             aclosing(step_all(engine, sequence, config, start=start, state=state)) as steps,
             aclosing(_started(result, steps)) as started,
-            # Closing waits for the threads that write. Afterwards the folder can be removed.
+            # No thread writes any more when this is closed. Then the folder can be removed.
             aclosing(in_order(started, write, limit=_UNWRITTEN, cancel_rest=False)) as written,
         ):
             async for stepped, found in written:
