@@ -114,9 +114,7 @@ class GrpcServer:
                 *_KEEPALIVE,
             ]
         )
-        depth_pb2_grpc.add_DepthServiceServicer_to_server(  # type: ignore[no-untyped-call]
-            self._servicer, self._server
-        )
+        depth_pb2_grpc.add_DepthServiceServicer_to_server(self._servicer, self._server)
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
         reflection.enable_server_reflection(
             [_SERVICE, health.SERVICE_NAME, reflection.SERVICE_NAME], self._server
