@@ -87,8 +87,8 @@ class DepthClient:
         iterations, cold_iterations
             Refinement iterations of a warm step and of a cold start; 0: the server's defaults.
         weights_sha256
-            The weights that results must come from (:attr:`vergence.ModelInfo.weights_sha256`); default:
-            those that the server runs, and the same ones after a reconnection.
+            The weights that results must come from (:attr:`vergence.ModelInfo.weights_sha256`);
+            default: those that the server runs, and the same ones after a reconnection.
         encoding
             The format of images on the wire: RAW is exact and large, PNG is exact and slow.
         jpeg_quality
