@@ -8,8 +8,8 @@ FOLDERS = ("client", "models", "proto", "service", "tests")
 
 # Old name, and the name that replaced it. Whole identifiers, not parts of them.
 RETIRED = {
-    "DATASETS": "DATASETS",
-    "DatasetError": "DatasetError",
+    "LAYOUTS": "DATASETS",
+    "LayoutError": "DatasetError",
     "OutputKind": "Output",
     "ResultForm": "ResultFormat",
     "Undeclarable": "Declaration",

@@ -45,7 +45,7 @@ async def test_a_newer_frame_displaces_one_that_waits_and_every_frame_is_account
     model: RecallModel,
 ) -> None:
     async with (
-        running_server(model, grpc__credit=5) as server,
+        running_server(model, streams__credit=5) as server,
         DepthClient(server.grpc_address) as client,
         client.open_session(RIG) as session,
     ):
@@ -104,7 +104,7 @@ async def test_a_step_that_is_displaced_raises_frame_stale(
     model: RecallModel,
 ) -> None:
     async with (
-        running_server(model, grpc__credit=3) as server,
+        running_server(model, streams__credit=3) as server,
         DepthClient(server.grpc_address) as client,
         client.open_session(RIG) as session,
     ):

@@ -47,7 +47,7 @@ def in_stages(
 
 
 def handed_on(parts: StepParts[ModelProto]) -> list[list[ValueInfoProto]]:
-    """The outputs of each graph of ``begin``, as :func:`stitched` names them."""
+    """The outputs of each graph of ``begin``, as ``stitch.stitched`` names them."""
     return [
         [renamed(entry, f"begin_{number}.{entry.name}") for entry in part.graph.output]
         for number, part in enumerate(parts.begin)

@@ -35,7 +35,7 @@ class QueueLimits:
 
 
 class JobQueue:
-    """Admits jobs and deletes them; :attr:`jobs` is for reading.
+    """Admits jobs and deletes them; ``jobs`` is for reading.
 
     Use it inside ``async with``. Jobs run after :meth:`start`. All methods belong to the event
     loop; threads touch the files and the database.
