@@ -10,6 +10,7 @@ from tests.support import dataset_trees as trees
 from tests.support import field_trees as field
 from tests.support.sources import assert_images, assert_poses, assert_truth, rig_of
 from tests.support.strategies import assert_same_pose
+from vergence.cli.play import source_at
 from vergence_proto.datasets import LAYOUTS, find_sources, open_source
 from vergence_proto.geometry import RectifiedRig
 
@@ -305,3 +306,58 @@ def test_what_windows_adds_to_text_is_no_data(kind: str, tmp_path: Path) -> None
         if first.frame.pose is not None and second.frame.pose is not None:
             expected = first.frame.pose.world_from_left
             assert_same_pose(second.frame.pose.world_from_left, expected, 0)
+
+
+TRUTH_OF_ONE = {
+    "sintel": "disparities/alley_1/frame_0002.png",
+    "vkitti2": "depth_00001.png",
+    "drivingstereo": "train-disparity-map/*/*-602.png",
+    "kittiraw": "groundtruth/image_02/0000000001.png",
+    "irs": "d_9.exr",
+    "apollo": "disparity/*26454_Camera_5.png",
+}
+
+
+@pytest.mark.parametrize("kind", TRUTH_OF_ONE)
+def test_a_frame_whose_truth_is_not_there_has_none(kind: str, tmp_path: Path) -> None:
+    path = field.TREES[kind](tmp_path)
+    (truth,) = tmp_path.rglob(TRUTH_OF_ONE[kind])
+    truth.unlink()
+    known = [each.truth_px is not None for each in open_source(f"{kind}:{path}")]
+    assert known == [True, False, True]
+
+
+IMAGES_ALONE = {
+    "sintel": "*_left/*/*.png *_right/*/*.png",
+    "spring": "frame_left/* frame_right/*",
+    "vkitti2": "rgb/*/*",
+    "booster": "camera_0?/*",
+    "instereo2k": "left.png right.png",
+    "drivingstereo": "*-image/*/*",
+    "middlebury2006": "view?.png",
+    "kittiraw": "image_0?/data/*",
+    "flyingthings": "image_clean/*/*",
+    "irs": "l_*.png r_*.png",
+    "apollo": "camera_?/*",
+}
+
+
+@pytest.mark.parametrize("kind", field.TREES)
+def test_images_alone_are_a_source_without_truth_poses_or_metres(kind: str, tmp_path: Path) -> None:
+    path = field.TREES[kind](tmp_path)
+    count = len(open_source(f"{kind}:{path}"))
+    kept = {each for like in IMAGES_ALONE[kind].split() for each in tmp_path.rglob(like)}
+    for file in tmp_path.rglob("*"):
+        if file.is_file() and not (file in kept and "proj_depth" not in file.parts):
+            file.unlink()
+    source = open_source(f"{kind}:{path}")
+    assert not source.metric
+    assert len(list(source)) == count
+    assert all(each.truth_px is None and each.frame.pose is None for each in source)
+    assert rig_of(source) == RectifiedRig(24, 16, 24, 24, 11.5, 11.5, 7.5, 0.1)
+
+
+@pytest.mark.parametrize("kind", LAYOUTS)
+def test_vergence_run_takes_the_kind(kind: str, tmp_path: Path) -> None:
+    path = ALL_TREES[kind](tmp_path)
+    assert len(source_at(f"{kind}:{path}{'?fx=20' if kind == 'sceneflow' else ''}")) > 0

@@ -51,7 +51,7 @@ def open_path(path: Path, *, steps: float = _STEPS_PER_PX) -> StereoSource:
             image_beside(left, path / "camera_6", left.stem.replace("Camera_5", "Camera_6")),
             _capture_ns(left),
             read_truth=partial(_truth, path, f"{left.stem}.png", steps)
-            if (path / "disparity").is_dir()
+            if (path / "disparity" / f"{left.stem}.png").is_file()
             else None,
         )
         for left in lefts

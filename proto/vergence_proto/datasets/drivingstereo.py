@@ -125,7 +125,7 @@ def _read_rig(path: Path, calib: str, size: tuple[int, int]) -> tuple[StereoRig,
 
 def _reader(path: Path, full: bool) -> Callable[[], Truth] | None:
     steps_per_px = _FULL_STEPS_PER_PX if full else _HALF_STEPS_PER_PX
-    return partial(_truth, path, steps_per_px) if path.parent.is_dir() else None
+    return partial(_truth, path, steps_per_px) if path.is_file() else None
 
 
 def _truth(path: Path, steps_per_px: float) -> Truth:

@@ -42,9 +42,11 @@ _SAME_FOCAL = 1e-3  # share of a change that is a rounding and no zoom
 
 def find(root: Path) -> list[Path]:
     """Every scene in or under ``root``, of either pass."""
-    passes = (folder for name in _PASSES for folder in found(root, name))
-    inside = [scene for each in passes for scene in sorted(each.iterdir()) if images(scene)]
-    return [root] if root.parent.name in _PASSES and images(root) else inside
+    if root.parent.name in _PASSES:
+        return [root] if images(root) else []
+    passes = [root] if root.name in _PASSES else []
+    passes += [folder for name in _PASSES for folder in found(root, name)]
+    return [scene for each in passes for scene in found(each, "*") if images(scene)]
 
 
 def open_path(path: Path) -> StereoSource:
@@ -83,7 +85,7 @@ def open_path(path: Path) -> StereoSource:
             nominal_ns(index, _FPS),
             cameras[number_in(left)][1] if number_in(left) in cameras else None,
             partial(_truth, split, Path(scene) / left.name)
-            if (split / "disparities" / scene).is_dir()
+            if (split / "disparities" / scene / left.name).is_file()
             else None,
         )
         for index, left in enumerate(lefts)

@@ -63,7 +63,7 @@ def open_path(path: Path) -> StereoSource:
                 image_beside(left, path / "frame_right", f"frame_right_{digits}"),
                 nominal_ns(index, None),
                 poses.get(number_in(left)),
-                partial(_truth, truth) if truth.parent.is_dir() else None,
+                partial(_truth, truth) if truth.is_file() else None,
             )
         )
     return StereoSource(path.name, rig, None, files, metric=metric)

@@ -65,7 +65,7 @@ def open_path(path: Path) -> StereoSource:
                 image_beside(left, rgb / "Camera_1", left.stem),
                 nominal_ns(index, _FPS),
                 poses.get(number_in(left)),
-                partial(_truth, truth, px_m) if depth.is_dir() and px_m else None,
+                partial(_truth, truth, px_m) if truth.is_file() and px_m else None,
             )
         )
     name = f"{path.parent.name}_{path.name}"
