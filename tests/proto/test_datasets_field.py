@@ -236,6 +236,7 @@ class TestMiddlebury2006:
             (scene / "Illum1" / "Exp1").mkdir(parents=True, exist_ok=True)
             (scene / name).rename(scene / "Illum1" / "Exp1" / name)
         source = open_source(f"middlebury2006:{scene / 'Illum1' / 'Exp1'}")
+        assert source.name == "Aloe_Illum1_Exp1"
         assert_truth(source, 0, field.grey_disparity(2)[1])
 
     @pytest.mark.parametrize(

@@ -1,13 +1,15 @@
 """OpenEXR files with one value per pixel.
 
-What renderers write most (scan lines, not compressed or by ZIP) is read here; other compressions
-need an OpenCV that was built with OpenEXR, which the wheels of OpenCV 5 are not.
+What renderers write most (scan lines, not compressed or by ZIP) is read here. Other kinds need the
+OpenEXR package, or an OpenCV that was built with OpenEXR, which the wheels of OpenCV 5 are not.
 """
 
+import importlib
 import os
 import struct
 import zlib
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,6 +20,7 @@ from vergence_proto.types import Plane
 _MAGIC = b"\x76\x2f\x31\x01"
 _TILED_OR_DEEP = 0x1A00
 _LINES_PER_BLOCK = {0: 1, 2: 1, 3: 16}  # compression: none, ZIPS, ZIP
+_CHANNELS = ("R", "Y", "G")
 _TYPES = {1: "<f2", 2: "<f4"}
 # OpenCV's releases with OpenEXR read files only when this variable says so.
 _OPENCV_SWITCH = "OPENCV_IO_ENABLE_OPENEXR"
@@ -32,17 +35,27 @@ def read_exr(path: Path) -> Plane:
     if not data.startswith(_MAGIC):
         raise LayoutError(f"{path}: expected OpenEXR, got a file starting {data[:4]!r}")
     try:
-        attributes, start = _header(data)
-        compression = attributes["compression"][0]
-        channels = _channels(attributes["channels"])
-        box = struct.unpack("<4i", attributes["dataWindow"])
-        (flags,) = struct.unpack_from("<I", data, 4)
-        own = compression in _LINES_PER_BLOCK and not flags & _TILED_OR_DEEP
-        if not own or any(kind not in _TYPES for _, kind in channels):
-            return _by_opencv(path)
-        return _scan_lines(data, start, box, channels, compression)
+        plane = _own_kind(data)
     except (KeyError, IndexError, ValueError, struct.error, zlib.error) as error:
         raise LayoutError(f"{path}: a damaged OpenEXR file: {error}") from None
+    return _by_library(path) if plane is None else plane
+
+
+def _own_kind(data: bytes) -> Plane | None:
+    """None: it is of a kind that only the libraries decode."""
+    attributes, start = _header(data)
+    compression = attributes["compression"][0]
+    channels = _channels(attributes["channels"])
+    (flags,) = struct.unpack_from("<I", data, 4)
+    own = compression in _LINES_PER_BLOCK and not flags & _TILED_OR_DEEP
+    if not own or any(kind not in _TYPES for _, kind in channels):
+        return None
+    box = struct.unpack("<4i", attributes["dataWindow"])
+    return _scan_lines(data, start, box, channels, compression)
+
+
+def _wanted(names: list[str]) -> str:
+    return next((name for name in _CHANNELS if name in names), names[0])
 
 
 def _header(data: bytes) -> tuple[dict[str, bytes], int]:
@@ -78,7 +91,6 @@ def _scan_lines(
     left, top, right, bottom = box
     width, height = right - left + 1, bottom - top + 1
     names = [name for name, _ in channels]
-    wanted = next((name for name in ("R", "Y", "G") if name in names), names[0])
     kinds = [np.dtype(_TYPES[kind]) for _, kind in channels]
     lines_per_block = _LINES_PER_BLOCK[compression]
     row = np.dtype([(str(k), kind, (width,)) for k, kind in enumerate(kinds)])
@@ -90,7 +102,7 @@ def _scan_lines(
         packed = data[at + 8 : at + 8 + size]
         raw = packed if size == lines * row.itemsize else _unzipped(packed)
         rows = np.frombuffer(raw, row, count=lines)
-        plane[first - top : first - top + lines] = rows[str(names.index(wanted))]
+        plane[first - top : first - top + lines] = rows[str(names.index(_wanted(names)))]
     return plane
 
 
@@ -103,6 +115,18 @@ def _unzipped(packed: bytes) -> bytes:
     whole = np.empty_like(halves)
     whole[0::2], whole[1::2] = halves[:middle], halves[middle:]
     return whole.tobytes()
+
+
+def _by_library(path: Path) -> Plane:
+    try:
+        openexr: Any = importlib.import_module("OpenEXR")
+    except ImportError:
+        return _by_opencv(path)
+    try:
+        channels = openexr.File(str(path), separate_channels=True).channels()
+    except (OSError, RuntimeError, ValueError) as error:
+        raise LayoutError(f"{path}: a damaged OpenEXR file: {error}") from None
+    return np.asarray(channels[_wanted(list(channels))].pixels, np.float32)
 
 
 def _by_opencv(path: Path) -> Plane:
@@ -119,8 +143,8 @@ def _by_opencv(path: Path) -> Plane:
             os.environ[_OPENCV_SWITCH] = before
     if decoded is None:
         raise LayoutError(
-            f"{path}: this kind of OpenEXR file needs an OpenCV built with OpenEXR; convert it to "
-            "scan lines with ZIP compression (oiiotool IN --compression zip -o OUT)"
+            f"{path}: this kind of OpenEXR file needs the OpenEXR package, which is not "
+            "installed: pip install OpenEXR"
         )
     plane = np.asarray(decoded, np.float32)
-    return plane if plane.ndim == 2 else plane[..., -1]  # BGR: red is the last
+    return plane if plane.ndim == 2 else plane[..., 2]  # BGR

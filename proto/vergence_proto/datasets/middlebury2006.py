@@ -57,11 +57,12 @@ def open_path(path: Path, *, scale: float | None = None) -> StereoSource:
         capture_ns=0,
         read_truth=partial(_truth, truth, scale) if truth.is_file() and scale else None,
     )
+    name = scene.name if scene == path else "_".join((scene.name, *path.parts[-2:]))
     dmin = scene / "dmin.txt"
     if not (dmin.is_file() and scale):
-        return StereoSource(scene.name, nominal_rig(path, size), None, [pair], metric=False)
+        return StereoSource(name, nominal_rig(path, size), None, [pair], metric=False)
     rig = _read_rig(dmin, size, scale)
-    return StereoSource(scene.name, rig, None, [pair], metric=scale == 1)
+    return StereoSource(name, rig, None, [pair], metric=scale == 1)
 
 
 def _images(path: Path) -> tuple[Path, Path, str] | None:
