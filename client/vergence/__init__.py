@@ -1,13 +1,13 @@
 """Live stereo depth over the network: the client.
 
-::
+Depth of one pair::
 
     import vergence
 
-    # One pair, one line.
     depth_m = vergence.depth(left, right, rig).depth_m
 
-    # A moving camera, live: one task films, another shows.
+A moving camera, live: one task submits frames, another reads results::
+
     async def film(session):
         async for left, right, world_from_left in camera:
             session.submit(left, right, world_from_left)
@@ -16,14 +16,16 @@
         async with client.open_session(rig) as session:
             filming = asyncio.create_task(film(session))
             async for result in session:
-                show(result.depth_m, result.age_s)
+                print(result.depth_m.shape, result.age_s)
 
-Everything public is in ``__all__``; modules behind it may change. The errors are those of
-:mod:`vergence_proto.errors`, re-exported here.
+Everything public is in ``__all__``; the modules behind it may change. The errors that a server
+raises are those of :mod:`vergence_proto.errors`; :class:`NotOpen` and :class:`ConnectionLost` are
+the client's own.
 """
 
 from vergence.blocking import BlockingClient, BlockingSession, depth
 from vergence.client import DEFAULT_SERVER, DepthClient
+from vergence.errors import NotOpen
 from vergence.info import ModelInfo, ServerInfo, StreamInfo
 from vergence.results import DepthResult, Drops, EventKind, SessionEvent
 from vergence.session import DepthSession
@@ -102,6 +104,7 @@ __all__ = [
     "ModelFailed",
     "ModelInfo",
     "NonFinite",
+    "NotOpen",
     "NotReady",
     "Origin",
     "OutputFormat",

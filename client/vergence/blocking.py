@@ -1,28 +1,25 @@
-"""The same client for programs without an event loop: every call waits for its answer.
+"""The blocking client, for programs without an event loop: every call waits for its result.
 
-The loop runs in one background thread, which the client's ``with`` starts and ends. Methods are
-those of :mod:`vergence.client` and :mod:`vergence.session`, with the same arguments and errors.
+An event loop runs in one background thread, which the client's ``with`` starts and ends.
 """
 
 import asyncio
-import functools
 import threading
 from collections.abc import Callable, Coroutine
-from typing import Any, Concatenate, Generic, ParamSpec, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vergence.client import DEFAULT_SERVER, DepthClient
-from vergence.info import ModelInfo
-from vergence.results import DepthResult, Drops
-from vergence.session import DepthSession
-from vergence_proto.geometry import RectifiedRig
-from vergence_proto.types import Delivery, StereoRig
+from vergence.errors import NotOpen
+from vergence.info import ModelInfo, ServerInfo, StreamInfo
+from vergence.results import DepthResult, Drops, SessionEvent
+from vergence.session import DepthSession, WorldFromLeft
+from vergence_proto.geometry import Axes, RectifiedRig
+from vergence_proto.types import Delivery, ImageEncoding, OutputFormat, StereoRig
 
-Inner = TypeVar("Inner")
 Value = TypeVar("Value")
-Args = ParamSpec("Args")
 
 
 def depth(
@@ -33,10 +30,39 @@ def depth(
     server: str = DEFAULT_SERVER,
     iterations: int = 0,
 ) -> DepthResult:
-    """Depth of one pair, alone: a stream is opened, stepped cold, and ended.
+    """Compute the depth of one pair, in a stream of its own.
 
-    Images are uint8, [H, W] or [H, W, 3] RGB; ``iterations`` are those of the cold start (0: the
-    server's default). Raises what :class:`~vergence.DepthSession` raises.
+    Parameters
+    ----------
+    left, right
+        uint8 [H, W] grey or [H, W, 3] RGB, of the rig's size.
+    rig
+        The cameras as they are; the server rectifies the images if the rig is not rectified.
+    server
+        The address of the server, as in :class:`DepthClient`.
+    iterations
+        Refinement iterations; 0: the server's default for a cold start.
+
+    Raises
+    ------
+    ValueError
+        ``server`` is no address of a server.
+    BadImage
+        An image is not uint8, or has another shape than those above.
+    BadShape
+        The images do not have the rig's size, or ``iterations`` is out of range.
+    BadCalibration
+        The server cannot use the rig.
+    FrameTooLarge
+        The frame has more bytes or pixels than the server accepts.
+    StreamLimit, StateMemory, Quota
+        The server has no room for another stream.
+    ModelFailed, NonFinite
+        The model failed on this pair.
+    Draining, NotReady
+        The server is shutting down, or is not ready yet.
+    ConnectionLost
+        The server cannot be reached.
     """
     with (
         BlockingClient(server) as client,
@@ -48,153 +74,373 @@ def depth(
 class _LoopThread:
     """An event loop in a thread, between :meth:`start` and :meth:`stop`."""
 
+    def __init__(self) -> None:
+        self._loop: asyncio.AbstractEventLoop | None = None
+
     def start(self) -> None:
         started = threading.Event()
-        # Not a daemon: it ends because stop() says so, and never in the middle of something.
+        # Not a daemon: stop() ends it, and never in the middle of a callback.
         self._thread = threading.Thread(target=self._main, args=(started,), name="vergence-client")
         self._thread.start()
         started.wait()
 
     def _main(self, started: threading.Event) -> None:
-        with asyncio.Runner() as runner:  # on leaving it cancels and awaits what is left
-            self._loop = runner.get_loop()
-            self._loop.call_soon(started.set)
-            self._loop.run_forever()
+        with asyncio.Runner() as runner:  # its exit cancels and awaits the remaining tasks
+            loop = runner.get_loop()
+            self._loop = loop
+            loop.call_soon(started.set)
+            loop.run_forever()
 
     def stop(self) -> None:
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join()
+        loop, self._loop = self._loop, None
+        if loop is not None:
+            loop.call_soon_threadsafe(loop.stop)
+            self._thread.join()
 
     def wait(self, work: Coroutine[Any, Any, Value]) -> Value:
+        if self._loop is None:
+            work.close()
+            raise NotOpen("the client is not open; write: with BlockingClient(server) as client")
         future = asyncio.run_coroutine_threadsafe(work, self._loop)
         try:
             return future.result()
-        except BaseException:  # an interrupt: what nobody waits for any more is called off
+        except BaseException:  # after an interrupt nobody waits for the result any more
             future.cancel()
             raise
 
+    def call(self, function: Callable[[], Value]) -> Value:
+        """Run a function in the loop's thread: a session must not be used from another one."""
 
-class _Blocking(Generic[Inner]):
-    def __init__(self, inner: Inner, loop: _LoopThread) -> None:
-        self._inner = inner
+        async def run() -> Value:
+            return function()
+
+        return self.wait(run())
+
+
+class BlockingSession:
+    """A :class:`DepthSession` whose ``step`` returns and whose iteration is ``for``.
+
+    :meth:`BlockingClient.open_session` makes it; use it inside ``with``. Every method but
+    ``__enter__`` raises :class:`NotOpen` before that.
+    """
+
+    def __init__(self, session: DepthSession, loop: _LoopThread, /) -> None:
+        self._session = session
         self._loop = loop
 
-
-def _waiting(
-    method: Callable[Concatenate[Inner, Args], Coroutine[Any, Any, Value]],
-) -> Callable[Concatenate[_Blocking[Inner], Args], Value]:
-    """The blocking form of a coroutine method."""
-
-    @functools.wraps(method)
-    def call(self: _Blocking[Inner], /, *args: Args.args, **kwargs: Args.kwargs) -> Value:
-        return self._loop.wait(method(self._inner, *args, **kwargs))
-
-    return call
-
-
-def _on_loop(
-    method: Callable[Concatenate[Inner, Args], Value],
-) -> Callable[Concatenate[_Blocking[Inner], Args], Value]:
-    """The same method, run in the loop's thread: a session is not to be touched from another."""
-
-    @functools.wraps(method)
-    def call(self: _Blocking[Inner], /, *args: Args.args, **kwargs: Args.kwargs) -> Value:
-        async def run() -> Value:
-            return method(self._inner, *args, **kwargs)
-
-        return self._loop.wait(run())
-
-    return call
-
-
-class BlockingSession(_Blocking[DepthSession]):
-    """A :class:`~vergence.DepthSession` whose ``step`` returns and whose iteration is ``for``."""
-
     def __enter__(self) -> Self:
-        self._loop.wait(self._inner.__aenter__())
+        """Open the stream; errors are those of :meth:`DepthSession.__aenter__`."""
+        self._loop.wait(self._session.__aenter__())
         return self
 
     def __exit__(self, *exc_info: object) -> None:
-        self._loop.wait(self._inner.__aexit__(*exc_info))
+        """End the stream; the server frees its state."""
+        self._loop.wait(self._session.__aexit__(*exc_info))
 
-    submit = _on_loop(DepthSession.submit)
-    step = _waiting(DepthSession.step)
-    reset = _on_loop(DepthSession.reset)
-    end = _on_loop(DepthSession.end)
+    def submit(
+        self,
+        left: NDArray[np.uint8],
+        right: NDArray[np.uint8],
+        world_from_left: WorldFromLeft = None,
+        *,
+        capture_ns: int | None = None,
+        max_age_s: float | None = None,
+    ) -> int | None:
+        """Send a live frame without waiting; its result comes by iteration.
+
+        Parameters
+        ----------
+        left, right
+            uint8 [H, W] grey or [H, W, 3] RGB, of the rig's size.
+        world_from_left
+            The left camera's pose at mid-exposure; None: not known.
+        capture_ns
+            ``time.monotonic_ns()`` at mid-exposure; default: now.
+        max_age_s
+            A frame that waits in the server for longer is dropped (``drops.stale``).
+
+        Returns
+        -------
+        int | None
+            The frame's id. None if the frame was dropped here (``drops.at_source``), because as
+            many frames as the credit allows are unanswered, or because the connection is down.
+
+        Raises
+        ------
+        BadImage
+            An image is not uint8, or has another shape than those above.
+        BadPose
+            The pose is not finite, or its rotation is not orthonormal with determinant +1.
+        RuntimeError
+            The session's delivery is EVERY, which must not drop frames; use :meth:`step`.
+        NotOpen
+            The session is not open, or has ended.
+        DepthError
+            The error that ended the stream, such as Superseded, StreamExpired or ConnectionLost.
+        """
+        return self._loop.call(
+            lambda: self._session.submit(
+                left, right, world_from_left, capture_ns=capture_ns, max_age_s=max_age_s
+            )
+        )
+
+    def step(
+        self,
+        left: NDArray[np.uint8],
+        right: NDArray[np.uint8],
+        world_from_left: WorldFromLeft = None,
+        *,
+        capture_ns: int | None = None,
+    ) -> DepthResult:
+        """Send a frame and wait for its result; calls that overlap are sent in order.
+
+        Overlap as many calls as :attr:`credit` to keep the server busy while frames travel.
+        Parameters are those of :meth:`submit`.
+
+        Raises
+        ------
+        BadImage
+            An image is not uint8, or has another shape than [H, W] or [H, W, 3].
+        BadPose
+            The pose is not finite, or its rotation is not orthonormal with determinant +1.
+        BadShape
+            The images do not have the rig's size.
+        FrameTooLarge
+            The frame has more bytes than the server accepts.
+        FrameStale
+            Delivery is NEWEST, and a newer frame displaced this one.
+        ModelFailed, NonFinite
+            The model failed on this frame; the stream continues.
+        ConnectionLost
+            The connection broke after the server took the frame, or could not be restored.
+        NotOpen
+            The session is not open, or has ended.
+        DepthError
+            The error that ended the stream, such as Superseded, StreamExpired or UnknownStream.
+        """
+        return self._loop.wait(
+            self._session.step(left, right, world_from_left, capture_ns=capture_ns)
+        )
+
+    def reset(self) -> None:
+        """Discard the stream's memory: the next frame is a cold start, as after a cut in a film.
+
+        Raises
+        ------
+        NotOpen
+            The session is not open, or has ended.
+        DepthError
+            The error that ended the stream.
+        """
+        self._loop.call(self._session.reset)
+
+    def end(self) -> None:
+        """Announce that no frame follows; iteration stops after the last answer.
+
+        Leaving ``async with`` does this too. A second call does nothing.
+
+        Raises
+        ------
+        NotOpen
+            The session was never open.
+        """
+        self._loop.call(self._session.end)
 
     def __iter__(self) -> Self:
+        """Iterate over the results of submitted frames."""
         return self
 
     def __next__(self) -> DepthResult:
+        """Wait for the next result; errors are those of :meth:`DepthSession.__anext__`."""
         try:
-            return self._loop.wait(self._inner.__anext__())
+            return self._loop.wait(self._session.__anext__())
         except StopAsyncIteration:
             raise StopIteration from None
 
     @property
     def stream_id(self) -> str:
-        return self._inner.stream_id
+        """The id of the stream on the server."""
+        return self._session.stream_id
 
     @property
     def resume_token(self) -> bytes:
-        return self._inner.resume_token
+        """The secret with which another session can take this stream over, by its stream id."""
+        return self._session.resume_token
 
     @property
     def rig(self) -> RectifiedRig:
-        return self._inner.rig
+        """The rig of every result: the one of ``open_session``, or its rectification."""
+        return self._session.rig
 
     @property
     def model(self) -> ModelInfo:
-        return self._inner.model
+        """The model that steps this stream."""
+        return self._session.model
 
     @property
     def credit(self) -> int:
-        return self._inner.credit
+        """The number of frames that may be unanswered at once."""
+        return self._session.credit
 
     @property
     def drops(self) -> Drops:
-        return self._inner.drops
+        """The frames that never became a result, until now."""
+        return self._session.drops
 
     @property
     def round_trip_s(self) -> float | None:
-        return self._inner.round_trip_s
+        """Network time in seconds, there and back, of the latest ping; None before the first."""
+        return self._session.round_trip_s
 
 
-def _session(
-    method: Callable[Concatenate[DepthClient, Args], DepthSession],
-) -> Callable[Concatenate["BlockingClient", Args], BlockingSession]:
-    @functools.wraps(method)
-    def call(self: "BlockingClient", /, *args: Args.args, **kwargs: Args.kwargs) -> BlockingSession:
-        return BlockingSession(method(self._inner, *args, **kwargs), self._loop)
+class BlockingClient:
+    """A :class:`DepthClient` with its own event loop, for use inside ``with``.
 
-    return call
+    ``on_event`` callbacks run in the loop's thread. Every method raises :class:`NotOpen` outside
+    ``with``.
 
+    Parameters
+    ----------
+    server
+        The address of the server, as in :class:`DepthClient`.
 
-class BlockingClient(_Blocking[DepthClient]):
-    """A :class:`~vergence.DepthClient` with its own event loop; use it inside ``with``.
-
-    Callbacks given as ``on_event`` run in the loop's thread.
+    Raises
+    ------
+    ValueError
+        ``server`` is no such address, or the package that its scheme needs is not installed.
     """
 
     def __init__(self, server: str = DEFAULT_SERVER) -> None:
-        super().__init__(DepthClient(server), _LoopThread())
+        self._client = DepthClient(server)
+        self._loop = _LoopThread()
 
     def __enter__(self) -> Self:
+        """Start the event loop; this does not connect yet."""
         self._loop.start()
         try:
-            self._loop.wait(self._inner.__aenter__())
+            self._loop.wait(self._client.__aenter__())
         except BaseException:
             self._loop.stop()
             raise
         return self
 
     def __exit__(self, *exc_info: object) -> None:
+        """Close the connection and end the event loop."""
         try:
-            self._loop.wait(self._inner.__aexit__(*exc_info))
+            self._loop.wait(self._client.__aexit__(*exc_info))
         finally:
             self._loop.stop()
 
-    open_session = _session(DepthClient.open_session)
-    server_info = _waiting(DepthClient.server_info)
-    stream_info = _waiting(DepthClient.stream_info)
-    close_stream = _waiting(DepthClient.close_stream)
+    def open_session(
+        self,
+        rig: StereoRig | RectifiedRig,
+        *,
+        axes: Axes = Axes.OPENCV,
+        delivery: Delivery = Delivery.NEWEST,
+        output: OutputFormat | None = None,
+        iterations: int = 0,
+        cold_iterations: int = 0,
+        weights_sha256: str = "",
+        encoding: ImageEncoding = ImageEncoding.RAW,
+        jpeg_quality: int = 90,
+        stream_id: str | None = None,
+        resume_token: bytes = b"",
+        on_event: Callable[[SessionEvent], None] | None = None,
+    ) -> BlockingSession:
+        """Make a session; its ``with`` opens the stream and ends it.
+
+        Parameters
+        ----------
+        rig
+            The cameras as they are; the server rectifies the images if the rig is not rectified.
+        axes
+            The axis convention of all poses of this session, sent and returned.
+        delivery
+            NEWEST: live, a newer frame displaces one that waits. EVERY: lossless, ``step`` only.
+        output
+            The content and precision of results. Default: disparity to 1/64 px, without confidence
+            and sigma; compressed without loss, unless the server is on this machine.
+        iterations, cold_iterations
+            Refinement iterations of a warm step and of a cold start; 0: the server's defaults.
+        weights_sha256
+            The weights that results must come from (:attr:`ModelInfo.weights_sha256`); default:
+            those that the server runs, and the same ones after a reconnection.
+        encoding
+            The format of images on the wire: RAW is exact and large, PNG is exact and slow.
+        jpeg_quality
+            The quality of ``ImageEncoding.JPEG``, 1 to 100.
+        stream_id
+            1 to 128 characters of [A-Za-z0-9._-]; default: a random one.
+        resume_token
+            Take over the open stream of this ``stream_id``; its old session gets Superseded.
+        on_event
+            Called in the loop's thread with each :class:`SessionEvent`; it must not block.
+
+        Raises
+        ------
+        BadShape
+            The stream id has other characters or another length.
+        BadCalibration
+            ``left_from_right`` is no rigid transform.
+        NotOpen
+            The client is not open.
+        """
+        session = self._client.open_session(
+            rig,
+            axes=axes,
+            delivery=delivery,
+            output=output,
+            iterations=iterations,
+            cold_iterations=cold_iterations,
+            weights_sha256=weights_sha256,
+            encoding=encoding,
+            jpeg_quality=jpeg_quality,
+            stream_id=stream_id,
+            resume_token=resume_token,
+            on_event=on_event,
+        )
+        return BlockingSession(session, self._loop)
+
+    def server_info(self) -> ServerInfo:
+        """Return the server's version, model and limits.
+
+        Raises
+        ------
+        ConnectionLost
+            The server cannot be reached.
+        NotReady
+            The server is starting, or the address does not belong to a Vergence server.
+        NotOpen
+            The client is not open.
+        """
+        return self._loop.wait(self._client.server_info())
+
+    def stream_info(self, stream_id: str) -> StreamInfo:
+        """Return the counters of one stream.
+
+        Raises
+        ------
+        UnknownStream
+            No stream of this id is open, and none was in the last minutes.
+        StreamExpired
+            The stream was idle or detached for too long and was discarded.
+        ConnectionLost
+            The server cannot be reached.
+        NotOpen
+            The client is not open.
+        """
+        return self._loop.wait(self._client.stream_info(stream_id))
+
+    def close_stream(self, stream_id: str) -> None:
+        """End a stream, even one that another client holds, and free its state.
+
+        Raises
+        ------
+        UnknownStream
+            No stream of this id is open.
+        ConnectionLost
+            The server cannot be reached.
+        NotOpen
+            The client is not open.
+        """
+        self._loop.wait(self._client.close_stream(stream_id))

@@ -1,41 +1,59 @@
-"""The way in: one client per server, any number of sessions on it."""
+"""The client of one server, with any number of sessions."""
 
 import uuid
 from collections.abc import Callable
 from typing import Self
 
+from vergence.errors import NotOpen
 from vergence.info import ServerInfo, StreamInfo
+from vergence.info_codec import server_info_from_proto, stream_info_from_proto
 from vergence.results import SessionEvent
-from vergence.session import DepthSession
+from vergence.session import DepthSession, SessionSetup
 from vergence.transports.addresses import connector, on_this_machine
+from vergence.transports.base import Transport
 from vergence_proto import codec
 from vergence_proto.geometry import Axes, RectifiedRig
 from vergence_proto.types import Delivery, ImageEncoding, OutputFormat, StereoRig, checked_stream_id
 from vergence_proto.v1 import depth_pb2 as pb
 
 DEFAULT_SERVER = "grpc://127.0.0.1:50051"
+"""The address of a server on this machine with its default port."""
 
 
 class DepthClient:
-    """A connection to a server; connects when it is first needed.
+    """A connection to a server, opened at the first request. Use it inside ``async with``.
 
-    ``server`` is ``grpc://HOST:PORT``, or ``zenoh://HOST:PORT[/NAMESPACE][?config=FILE]`` with the
-    place of a Zenoh router, of which a server can be one, or ``http://HOST:PORT`` where nothing
-    else gets through; anything else is a ValueError. Every method raises NotReady (ConnectionLost)
-    where the server cannot be reached, and otherwise the class of :mod:`vergence_proto.errors` that
-    the server raised. Use it inside ``async with``, from one event loop.
+    Use a client from one event loop. Every method raises :class:`NotOpen` outside ``async with``.
+
+    Parameters
+    ----------
+    server
+        ``grpc://HOST:PORT``; or ``zenoh://HOST:PORT[/NAMESPACE][?config=FILE]``, the address of a
+        Zenoh router or of a server that is one; or ``http://HOST:PORT`` (or ``https``), for
+        networks that let nothing else through.
+
+    Raises
+    ------
+    ValueError
+        ``server`` is no such address, or the package that its scheme needs is not installed.
     """
 
     def __init__(self, server: str = DEFAULT_SERVER) -> None:
+        self._server = server
         self._connect = connector(server)
         self._on_this_machine = on_this_machine(server)
+        self._transport: Transport | None = None
 
     async def __aenter__(self) -> Self:
+        """Make the client ready; this does not connect yet."""
         self._transport = self._connect()
         return self
 
     async def __aexit__(self, *exc_info: object) -> None:
-        await self._transport.close()
+        """Close the connection; sessions that are still open end with ConnectionLost."""
+        transport, self._transport = self._transport, None
+        if transport is not None:
+            await transport.close()
 
     def open_session(
         self,
@@ -53,36 +71,45 @@ class DepthClient:
         resume_token: bytes = b"",
         on_event: Callable[[SessionEvent], None] | None = None,
     ) -> DepthSession:
-        """A session, to be used inside ``async with``, which opens the stream and ends it.
+        """Make a session; its ``async with`` opens the stream and ends it.
 
         Parameters
         ----------
         rig
-            The cameras as they are; the server rectifies if they are not.
+            The cameras as they are; the server rectifies the images if the rig is not rectified.
         axes
-            The convention of all poses of this session, in and out.
+            The axis convention of all poses of this session, sent and returned.
         delivery
-            NEWEST: live, a newer frame displaces one that waits. EVERY: lossless, step() only.
+            NEWEST: live, a newer frame displaces one that waits. EVERY: lossless, ``step`` only.
         output
-            What results carry and how exactly; default: disparity to 1/64 px, compressed (which
-            loses nothing) unless the server is on this machine, where it would only cost time.
+            The content and precision of results. Default: disparity to 1/64 px, without confidence
+            and sigma; compressed without loss, unless the server is on this machine.
         iterations, cold_iterations
-            Refinements of a warm step and of a cold start; 0: the server's defaults.
+            Refinement iterations of a warm step and of a cold start; 0: the server's defaults.
         weights_sha256
-            The weights that results must come from (:attr:`ModelInfo.weights_sha256`), where they
-            must be comparable; default: whatever the server runs, and the same after a resume.
+            The weights that results must come from (:attr:`vergence.ModelInfo.weights_sha256`); default:
+            those that the server runs, and the same ones after a reconnection.
         encoding
-            How images travel: RAW is exact and costs bandwidth, PNG is exact and costs time.
+            The format of images on the wire: RAW is exact and large, PNG is exact and slow.
+        jpeg_quality
+            The quality of ``ImageEncoding.JPEG``, 1 to 100.
         stream_id
             1 to 128 characters of [A-Za-z0-9._-]; default: a random one.
         resume_token
-            Takes over the open stream of this ``stream_id``; its old session gets Superseded.
+            Take over the open stream of this ``stream_id``; its old session gets Superseded.
         on_event
-            Called in the event loop with what happens to the session; must not block.
+            Called in the event loop with each :class:`SessionEvent`; it must not block.
 
-        Raises BadShape: the stream id. Entering raises BadCalibration, ModelChanged, StreamExists,
-        Quota, StreamLimit, StateMemory, Draining, NotReady.
+        Raises
+        ------
+        BadShape
+            The stream id has other characters or another length.
+        BadCalibration
+            ``left_from_right`` is no rigid transform.
+        NotOpen
+            The client is not open.
         """
+        transport = self._open_transport()
         opening = pb.OpenStream(
             stream_id=checked_stream_id(uuid.uuid4().hex if stream_id is None else stream_id),
             resume_token=resume_token,
@@ -99,25 +126,70 @@ class DepthClient:
             weights_sha256=weights_sha256,
         )
         return DepthSession(
-            self._transport,
-            opening,
-            encoding=encoding,
-            jpeg_quality=jpeg_quality,
-            on_event=on_event,
+            SessionSetup(
+                transport=transport,
+                opening=opening,
+                delivery=delivery,
+                encoding=encoding,
+                jpeg_quality=jpeg_quality,
+                on_event=on_event,
+            )
         )
 
     async def server_info(self) -> ServerInfo:
+        """Return the server's version, model and limits.
+
+        Raises
+        ------
+        ConnectionLost
+            The server cannot be reached.
+        NotReady
+            The server is starting, or the address does not belong to a Vergence server.
+        NotOpen
+            The client is not open.
+        """
         request = pb.GetServerInfoRequest()
-        response = await self._transport.ask("GetServerInfo", request, pb.GetServerInfoResponse)
-        return ServerInfo.from_proto(response)
+        transport = self._open_transport()
+        response = await transport.ask("GetServerInfo", request, pb.GetServerInfoResponse)
+        return server_info_from_proto(response)
 
     async def stream_info(self, stream_id: str) -> StreamInfo:
-        """Raises UnknownStream, StreamExpired."""
+        """Return the counters of one stream.
+
+        Raises
+        ------
+        UnknownStream
+            No stream of this id is open, and none was in the last minutes.
+        StreamExpired
+            The stream was idle or detached for too long and was discarded.
+        ConnectionLost
+            The server cannot be reached.
+        NotOpen
+            The client is not open.
+        """
         request = pb.GetStreamRequest(stream_id=stream_id)
-        response = await self._transport.ask("GetStream", request, pb.GetStreamResponse)
-        return StreamInfo.from_proto(response)
+        transport = self._open_transport()
+        response = await transport.ask("GetStream", request, pb.GetStreamResponse)
+        return stream_info_from_proto(response)
 
     async def close_stream(self, stream_id: str) -> None:
-        """End a stream, whoever holds it, and free its state. Raises UnknownStream."""
+        """End a stream, even one that another client holds, and free its state.
+
+        Raises
+        ------
+        UnknownStream
+            No stream of this id is open.
+        ConnectionLost
+            The server cannot be reached.
+        NotOpen
+            The client is not open.
+        """
         request = pb.CloseStreamRequest(stream_id=stream_id)
-        await self._transport.ask("CloseStream", request, pb.CloseStreamResponse)
+        await self._open_transport().ask("CloseStream", request, pb.CloseStreamResponse)
+
+    def _open_transport(self) -> Transport:
+        if self._transport is None:
+            raise NotOpen(
+                f"the client is not open; write: async with DepthClient({self._server!r}) as client"
+            )
+        return self._transport

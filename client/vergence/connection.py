@@ -1,4 +1,4 @@
-"""A stream's way to the server: opened, kept alive, and made again when it breaks."""
+"""The connection of one stream: opened, kept alive, and reopened when it breaks."""
 
 import asyncio
 import random
@@ -25,51 +25,54 @@ _NOTICES = {
 }
 
 
-class LinkUser(Protocol):
-    """What the link tells its session; none of it may block."""
+class StreamListener(Protocol):
+    """Receives what arrives on a :class:`StreamConnection`; no method may block."""
 
     def attached(self, opened: pb.StreamOpened) -> list[bytes]:
         """The stream is open, or open again; returns what must be sent again."""
 
-    def detached(self, lost: ConnectionLost) -> None: ...
+    def detached(self, lost: ConnectionLost) -> None:
+        """The connection broke; the stream may be open again later."""
 
-    def answered(self, response: pb.StreamDepthResponse) -> None: ...
+    def answered(self, response: pb.StreamDepthResponse) -> None:
+        """A response about a frame arrived."""
 
     def ended(self, error: Exception | None) -> None:
-        """Nothing comes any more; with None because the session asked for it."""
+        """No response follows; ``error`` is None if the session asked for the end."""
 
 
-class Link:
+class StreamConnection:
     """Attach to one stream, and resume it with its token for as long as the server keeps it."""
 
     def __init__(
         self,
         transport: Transport,
         opening: pb.OpenStream,
-        user: LinkUser,
+        listener: StreamListener,
         on_event: Callable[[SessionEvent], None] | None,
     ) -> None:
         self._transport = transport
         self._opening = opening
-        self._user = user
+        self._listener = listener
         self._on_event = on_event
         self._outbox: asyncio.Queue[bytes] = asyncio.Queue()
         self._ending = False
-        self.up = False  # a frame handed over now goes out at once
+        self.up: bool = False  # True: a frame that is sent now leaves at once
         self.round_trip_s: float | None = None
 
     @property
     def ending(self) -> bool:
+        """Return True once the end was requested or has come."""
         return self._ending
 
     async def open(self) -> None:
-        """Attach, and keep at it in the background until :meth:`close`."""
+        """Attach, and reattach in the background until :meth:`close`."""
         call = await self._attach()
         name = f"vergence stream {self._opening.stream_id}"
         self._runner = asyncio.create_task(self._run(call), name=name)
 
     async def close(self) -> None:
-        """Let the server answer what it has, for a moment, and be done with it."""
+        """Wait for the last answers, at most two seconds, and close."""
         self.end()
         try:
             await asyncio.wait({self._runner}, timeout=_CLOSE_TIMEOUT_S)
@@ -82,6 +85,7 @@ class Link:
         self._outbox.put_nowait(request)
 
     def end(self) -> None:
+        """Request the end of the stream, once."""
         if not self._ending:
             self._ending = True
             self.send(_END)
@@ -92,14 +96,14 @@ class Link:
             while (lost := await self._converse(call)) is not None:
                 call = await self._resume(lost)
             error = None
-        except Exception as fatal:  # whatever it is, those who wait for an answer must hear it
+        except Exception as fatal:  # whatever it is, every waiting step must raise it
             error = fatal
         finally:
             self._ending = True
-            self._user.ended(error)
+            self._listener.ended(error)
 
     async def _converse(self, call: Call) -> ConnectionLost | None:
-        """Send and receive until the call ends: None if that was asked for, else how it broke."""
+        """Send and receive until the call ends; None if the end was requested, else the failure."""
         helpers = [asyncio.create_task(self._send_all(call)), asyncio.create_task(self._ping())]
         try:
             while (response := await call.receive()) is not None:
@@ -135,16 +139,16 @@ class Link:
             self._opening.resume_token = response.opened.resume_token
             self._opening.weights_sha256 = response.opened.model.weights_sha256
             self._grace_s = response.opened.detach_grace_s
-            again = self._user.attached(response.opened)
+            resend = self._listener.attached(response.opened)
         except TimeoutError:
             await call.close()
             raise ConnectionLost(f"the server did not answer in {_OPEN_TIMEOUT_S:g} s") from None
         except BaseException:
             await call.close()
             raise
-        # What was queued for the broken connection is in `again`, or too old to be sent.
+        # Requests queued for the broken connection are in `resend`, or too old to be sent.
         self._outbox = asyncio.Queue()
-        for request in again:
+        for request in resend:
             self.send(request)
         if self._ending:
             self.send(_END)
@@ -152,8 +156,8 @@ class Link:
         return call
 
     async def _resume(self, lost: ConnectionLost) -> Call:
-        self._user.detached(lost)
-        self._tell(SessionEvent(EventKind.DISCONNECTED, str(lost)))
+        self._listener.detached(lost)
+        self._report(SessionEvent(EventKind.DISCONNECTED, str(lost)))
         started, delay_s = time.monotonic(), _FIRST_RETRY_S
         while True:
             try:
@@ -162,13 +166,13 @@ class Link:
                 if time.monotonic() + delay_s - started > self._grace_s:
                     raise ConnectionLost(
                         f"could not reach the server again in {self._grace_s:g} s, after which it "
-                        f"forgets the stream; open a new session ({error})"
+                        f"discards the stream; open a new session ({error})"
                     ) from error
             else:
                 away_s = time.monotonic() - started
-                self._tell(SessionEvent(EventKind.RESUMED, f"resumed after {away_s:.2f} s"))
+                self._report(SessionEvent(EventKind.RESUMED, f"resumed after {away_s:.2f} s"))
                 return call
-            # Half of it by chance: after an outage not all clients knock at once.
+            # Half of the delay is random, so that clients do not all reconnect at once.
             await asyncio.sleep(delay_s * random.uniform(0.5, 1.0))
             delay_s = min(2 * delay_s, _LAST_RETRY_S)
 
@@ -180,10 +184,10 @@ class Link:
                 self.round_trip_s = elapsed_ns * 1e-9
             case "notice" if response.notice.kind in _NOTICES:
                 notice = response.notice
-                self._tell(SessionEvent(_NOTICES[notice.kind], notice.message, notice.in_s))
+                self._report(SessionEvent(_NOTICES[notice.kind], notice.message, notice.in_s))
             case _:
-                self._user.answered(response)
+                self._listener.answered(response)
 
-    def _tell(self, event: SessionEvent) -> None:
+    def _report(self, event: SessionEvent) -> None:
         if self._on_event is not None:
             self._on_event(event)

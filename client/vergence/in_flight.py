@@ -1,4 +1,4 @@
-"""The ledger of a session's frames: which are unanswered, and what became of the others."""
+"""The frames of a session that were sent and not answered, and the count of those dropped."""
 
 import asyncio
 from collections.abc import Iterable
@@ -8,55 +8,61 @@ from vergence.results import DepthResult, Drops
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Flight:
+class FrameInFlight:
     """A frame that was sent and not answered yet."""
 
     frame_id: int
-    request: bytes  # as it was sent
-    answer: asyncio.Future[DepthResult] | None  # None: live, nobody waits for this very frame
+    request: bytes
+    """The serialized request, kept to send it again after a reconnection."""
+    answer: asyncio.Future[DepthResult] | None
+    """The result that ``step`` waits for; None for a live frame, whose result is iterated."""
 
     def fail(self, error: Exception) -> None:
+        """Raise ``error`` in the ``step`` that waits for this frame, if one does."""
         if self.answer is not None and not self.answer.done():
             self.answer.set_exception(error)
 
 
-class Flights:
-    """Frames in the air, in the order they were sent, never more than the server's credit."""
+class FramesInFlight:
+    """Frames without an answer, in the order they were sent, at most ``credit`` of them."""
 
     def __init__(self) -> None:
-        self.credit = 1
-        self.drops = Drops()
-        self._by_id: dict[int, Flight] = {}
-        self._landed = asyncio.Event()
+        self.credit: int = 1
+        self.drops: Drops = Drops()
+        self._by_id: dict[int, FrameInFlight] = {}
+        self._removed = asyncio.Event()
 
     @property
     def has_room(self) -> bool:
+        """Return True if the credit allows one more frame."""
         return len(self._by_id) < self.credit
 
-    async def room(self) -> None:
-        """Wait until the credit allows one more."""
+    async def wait_for_room(self) -> None:
+        """Wait until the credit allows one more frame."""
         while not self.has_room:
-            self._landed.clear()
-            await self._landed.wait()
+            self._removed.clear()
+            await self._removed.wait()
 
-    def launch(self, flight: Flight) -> None:
-        self._by_id[flight.frame_id] = flight
+    def add(self, frame: FrameInFlight) -> None:
+        """Record a frame that is sent now."""
+        self._by_id[frame.frame_id] = frame
 
-    def land(self, frame_id: int) -> Flight | None:
-        """The flight that was answered; None for one that has been given up since."""
-        flight = self._by_id.pop(frame_id, None)
-        self._landed.set()
-        return flight
+    def pop(self, frame_id: int) -> FrameInFlight | None:
+        """Remove and return a frame that was answered; None if it was removed before."""
+        frame = self._by_id.pop(frame_id, None)
+        self._removed.set()
+        return frame
 
-    def abandon(self, flights: Iterable[Flight], error: Exception) -> None:
-        """Give up flights that will not be answered."""
-        for flight in flights:
-            self.land(flight.frame_id)
-            if flight.answer is None:
+    def fail(self, frames: Iterable[FrameInFlight], error: Exception) -> None:
+        """Remove frames that will not be answered; live ones count as lost."""
+        for frame in frames:
+            self.pop(frame.frame_id)
+            if frame.answer is None:
                 self.count(lost=1)
-            flight.fail(error)
+            frame.fail(error)
 
-    def in_order(self) -> list[Flight]:
+    def in_order(self) -> list[FrameInFlight]:
+        """Return all frames without an answer, in the order they were sent."""
         return list(self._by_id.values())
 
     def count(self, **dropped: int) -> None:

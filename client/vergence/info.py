@@ -1,49 +1,44 @@
-"""What a server says about itself and its streams."""
+"""A server's description of itself, its model and its streams."""
 
 from dataclasses import dataclass
-from typing import Self
-
-from vergence_proto.v1 import depth_pb2 as pb
 
 
 @dataclass(frozen=True, slots=True)
 class ModelInfo:
-    name: str
-    weights_sha256: str
-    iterations: tuple[int, ...]  # the counts a step can run
-    max_disparity_px: int
+    """The network and weights that a server runs."""
 
-    @classmethod
-    def from_proto(cls, message: pb.ModelInfo) -> Self:
-        iterations = tuple(message.iterations)
-        return cls(message.name, message.weights_sha256, iterations, message.max_disparity_px)
+    name: str
+    """The name of the model, such as ``lite``."""
+    weights_sha256: str
+    """SHA-256 of the weights, 64 hexadecimal digits; equal digests give comparable results."""
+    iterations: tuple[int, ...]
+    """The iteration counts that a step can run."""
+    max_disparity_px: int
+    """The largest disparity in pixels that the model searches."""
 
 
 @dataclass(frozen=True, slots=True)
 class ServerInfo:
-    version: str
-    model: ModelInfo
-    provider: str  # what the model runs on, as onnxruntime names it
-    engine: str  # what computes it, with its version; empty: an older server
-    instruction_set: str  # the best of the server's CPU for int8; empty: an older server
-    streams_open: int
-    streams_max: int
-    max_message_bytes: int
-    max_pixels: int  # of one image
+    """A server, its model and its limits."""
 
-    @classmethod
-    def from_proto(cls, message: pb.GetServerInfoResponse) -> Self:
-        return cls(
-            version=message.version,
-            model=ModelInfo.from_proto(message.model),
-            provider=message.provider,
-            engine=message.engine,
-            instruction_set=message.instruction_set,
-            streams_open=message.streams_open,
-            streams_max=message.streams_max,
-            max_message_bytes=message.max_message_bytes,
-            max_pixels=message.max_pixels,
-        )
+    version: str
+    """The version of the server."""
+    model: ModelInfo
+    """The model that new streams use."""
+    provider: str
+    """The device that runs the model, by its onnxruntime name."""
+    engine: str
+    """The runtime and its version; empty from an older server."""
+    instruction_set: str
+    """The best int8 instruction set of the server's CPU; empty from an older server."""
+    streams_open: int
+    """Streams that are open now."""
+    streams_max: int
+    """Streams that may be open at once."""
+    max_message_bytes: int
+    """The largest message in bytes that the server accepts."""
+    max_pixels: int
+    """The largest number of pixels of one image."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,25 +46,20 @@ class StreamInfo:
     """One stream as the server sees it."""
 
     stream_id: str
-    attached: bool  # a connection holds it
+    """The id of the stream."""
+    attached: bool
+    """A connection holds the stream now."""
     frames_stepped: int
+    """Frames that the model processed."""
     frames_dropped: int
+    """Frames that the server dropped."""
     frames_failed: int
+    """Frames that ended in an error."""
     last_frame_id: int
-    step_count: int  # steps since the state was new; 0: the next one is a cold start
+    """The id of the last frame that the server accepted; 0: none."""
+    step_count: int
+    """Steps since the state was new; 0: the next step is a cold start."""
     idle_s: float
+    """Seconds since the last frame."""
     state_bytes: int
-
-    @classmethod
-    def from_proto(cls, message: pb.GetStreamResponse) -> Self:
-        return cls(
-            stream_id=message.stream_id,
-            attached=message.attached,
-            frames_stepped=message.frames_stepped,
-            frames_dropped=message.frames_dropped,
-            frames_failed=message.frames_failed,
-            last_frame_id=message.last_frame_id,
-            step_count=message.step_count,
-            idle_s=message.idle_s,
-            state_bytes=message.state_bytes,
-        )
+    """Memory of the stream's state in bytes."""

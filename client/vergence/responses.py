@@ -1,34 +1,40 @@
-"""What comes back from the server, and whom it is for."""
+"""Routing of a stream's responses to the calls and readers that wait for them."""
 
 import asyncio
 import time
 from collections import deque
+from dataclasses import fields
 
 from vergence.connection import RESET
-from vergence.in_flight import Flights
-from vergence.results import DepthResult
+from vergence.in_flight import FramesInFlight
+from vergence.results import DepthResult, Drops
 from vergence.transports.base import ConnectionLost
 from vergence_proto import codec
 from vergence_proto.errors import DepthError, FrameStale
 from vergence_proto.geometry import RectifiedRig
+from vergence_proto.types import DisparityMap
 from vergence_proto.v1 import depth_pb2 as pb
 
 
-class Answers:
-    """The ear of a session at its :class:`~vergence.connection.Link`: one of its ``LinkUser``s."""
+class ResponseRouter:
+    """The :class:`~vergence.connection.StreamListener` of a session.
 
-    opened: pb.StreamOpened
+    It resolves the frames in flight, and keeps the results of live frames for the reader.
+    """
+
     rig: RectifiedRig
 
-    def __init__(self) -> None:
-        self.flights = Flights()
-        self.error: Exception | None = None
+    def __init__(self, in_flight: FramesInFlight) -> None:
+        self.opened: pb.StreamOpened | None = None  # None: the stream was never open
+        self.error: Exception | None = None  # the error that ended the stream
         self.reset_after: int | None = None  # the last frame before a reset not yet confirmed
+        self._in_flight = in_flight
         self._ended = False
         self._unread: deque[DepthResult | DepthError] = deque()
         self._arrived = asyncio.Event()
 
     async def next(self) -> DepthResult:
+        """Wait for the next live result; raises its error, or the one that ended the stream."""
         while not self._unread:
             if self._ended:
                 raise self.error or StopAsyncIteration
@@ -40,31 +46,34 @@ class Answers:
         return item
 
     def attached(self, opened: pb.StreamOpened) -> list[bytes]:
+        """Record the open stream; return the requests that must be sent again."""
         self.opened = opened
         self.rig = codec.rectified_rig_from_proto(opened.rig)
-        self.flights.credit = max(opened.credit, 1)
+        self._in_flight.credit = max(opened.credit, 1)
         taken = ConnectionLost("the connection broke after the server took the frame")
-        flights = self.flights.in_order()
-        self.flights.abandon((f for f in flights if f.frame_id <= opened.last_frame_id), taken)
-        flights = self.flights.in_order()
-        requests = [flight.request for flight in flights]
+        frames = self._in_flight.in_order()
+        self._in_flight.fail((f for f in frames if f.frame_id <= opened.last_frame_id), taken)
+        frames = self._in_flight.in_order()
+        requests = [frame.request for frame in frames]
         if self.reset_after is not None:
-            before = sum(flight.frame_id <= self.reset_after for flight in flights)
+            before = sum(frame.frame_id <= self.reset_after for frame in frames)
             requests.insert(before, RESET)
         return requests
 
     def detached(self, lost: ConnectionLost) -> None:
-        # A live frame is old by the time the connection is back; what is awaited is sent again.
-        self.flights.abandon((f for f in self.flights.in_order() if f.answer is None), lost)
+        """Discard the live frames: they will be old by the time the connection is back."""
+        self._in_flight.fail((f for f in self._in_flight.in_order() if f.answer is None), lost)
 
     def ended(self, error: Exception | None) -> None:
+        """Fail what is still in flight, and end the iteration."""
         self._ended = True
         self.error = error
         unanswered = error or ConnectionLost("the stream ended before the frame was answered")
-        self.flights.abandon(self.flights.in_order(), unanswered)
+        self._in_flight.fail(self._in_flight.in_order(), unanswered)
         self._arrived.set()
 
     def answered(self, response: pb.StreamDepthResponse) -> None:
+        """Route one response to its frame."""
         match response.WhichOneof("message"):
             case "disparity":
                 self._map(response.disparity)
@@ -81,42 +90,47 @@ class Answers:
             self.reset_after = None
         try:
             disparity_map = codec.disparity_from_proto(message, self.rig)
-        except DepthError as error:  # a damaged answer is the trouble of its frame alone
+        except DepthError as error:  # a damaged answer fails its own frame only
             self._failed(message.frame_id, error)
             return
-        flight = self.flights.land(message.frame_id)
-        result = DepthResult.of(disparity_map, age_s=age_s, drops=self.flights.drops)
-        if flight is None:
+        frame = self._in_flight.pop(message.frame_id)
+        result = _depth_result(disparity_map, age_s=age_s, drops=self._in_flight.drops)
+        if frame is None:
             return
-        if flight.answer is None:
+        if frame.answer is None:
             self._deliver(result)
-        elif not flight.answer.done():  # it is done if the caller gave up
-            flight.answer.set_result(result)
+        elif not frame.answer.done():  # done: the caller was cancelled
+            frame.answer.set_result(result)
 
     def _failed(self, frame_id: int, error: DepthError) -> None:
-        flight = self.flights.land(frame_id)
-        if flight is None:
+        frame = self._in_flight.pop(frame_id)
+        if frame is None:
             return
-        if flight.answer is not None:
-            flight.fail(error)
+        if frame.answer is not None:
+            frame.fail(error)
         elif isinstance(error, FrameStale):
-            self.flights.count(stale=1)
+            self._in_flight.count(stale=1)
         else:
             self._deliver(error)
 
     def _dropped(self, frame_id: int) -> None:
-        flight = self.flights.land(frame_id)
-        if flight is None:
+        frame = self._in_flight.pop(frame_id)
+        if frame is None:
             return
-        if flight.answer is None:
-            self.flights.count(displaced=1)
-        flight.fail(FrameStale(f"frame {frame_id} was displaced by a newer one"))
+        if frame.answer is None:
+            self._in_flight.count(displaced=1)
+        frame.fail(FrameStale(f"frame {frame_id} was displaced by a newer one"))
 
     def _deliver(self, item: DepthResult | DepthError) -> None:
-        """Keep for the reader what arrived, at most as many results as the credit: the newest."""
+        """Keep an item for the reader; of the results keep the newest, as many as the credit."""
         self._unread.append(item)
         results = [each for each in self._unread if isinstance(each, DepthResult)]
-        if len(results) > self.flights.credit:
+        if len(results) > self._in_flight.credit:
             self._unread.remove(results[0])
-            self.flights.count(unread=1)
+            self._in_flight.count(unread=1)
         self._arrived.set()
+
+
+def _depth_result(disparity_map: DisparityMap, *, age_s: float, drops: Drops) -> DepthResult:
+    values = {each.name: getattr(disparity_map, each.name) for each in fields(DisparityMap)}
+    return DepthResult(**values, age_s=age_s, drops=drops)

@@ -1,6 +1,6 @@
-"""What a session hands out: results, the count of what did not become one, and events."""
+"""Results of a session, the count of frames without a result, and events."""
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 from vergence_proto.types import DisparityMap
@@ -8,49 +8,61 @@ from vergence_proto.types import DisparityMap
 
 @dataclass(frozen=True, slots=True)
 class Drops:
-    """Frames of a session that were submitted and never became a result, by where they ended.
+    """The number of submitted frames that never became a result, by where they ended.
 
-    With every frame answered, ``submitted = results + errors raised + drops.total``.
+    Once every frame is answered, ``submitted == results + errors raised + drops.total``.
     """
 
-    at_source: int = 0  # submitted while as many as the credit allows were unanswered; never sent
-    displaced: int = 0  # a newer frame took their place in the server, or on a full network
-    stale: int = 0  # older than their max_age_s when their turn came
-    unread: int = 0  # their results came, and newer ones, before anybody read them
-    lost: int = 0  # unanswered when the connection broke
+    at_source: int = 0
+    """Not sent: as many frames as the credit allows were unanswered, or the connection was down."""
+    displaced: int = 0
+    """Displaced by a newer frame in the server, or on a full network."""
+    stale: int = 0
+    """Older than their ``max_age_s`` when their turn came."""
+    unread: int = 0
+    """Results that arrived and were displaced by newer ones before the program read them."""
+    lost: int = 0
+    """Unanswered when the connection broke."""
 
     @property
     def total(self) -> int:
+        """The sum of all drops."""
         return self.at_source + self.displaced + self.stale + self.unread + self.lost
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthResult(DisparityMap):
-    """A disparity map, and how it came.
+    """A disparity map with its age and the session's drops.
 
-    Pixels are those of the rectified left image (``rig``); poses are in the session's axes.
+    Pixels are those of the rectified left image (``rig``). Poses are in the session's axes.
     """
 
-    age_s: float = 0.0  # from capture_ns to the arrival of this result
-    drops: Drops = field(default_factory=Drops)  # of the session, up to here
-
-    @classmethod
-    def of(cls, disparity_map: DisparityMap, *, age_s: float, drops: Drops) -> "DepthResult":
-        values = {each.name: getattr(disparity_map, each.name) for each in fields(DisparityMap)}
-        return cls(**values, age_s=age_s, drops=drops)
+    age_s: float = 0.0
+    """Seconds from ``capture_ns`` to the arrival of this result."""
+    drops: Drops = field(default_factory=Drops)
+    """The drops of the session until this result."""
 
 
 class EventKind(StrEnum):
-    DISCONNECTED = "disconnected"  # the connection broke; the session is trying to resume
-    RESUMED = "resumed"  # it is back, and the stream's state was kept
-    DRAINING = "draining"  # the server is shutting down
-    EXPIRING = "expiring"  # no frame has come for long; the server will forget the stream
+    """The kind of a :class:`SessionEvent`."""
+
+    DISCONNECTED = "disconnected"
+    """The connection broke; the session is trying to resume."""
+    RESUMED = "resumed"
+    """The connection is back, and the stream's state was kept."""
+    DRAINING = "draining"
+    """The server is shutting down."""
+    EXPIRING = "expiring"
+    """No frame has come for long; the server will discard the stream."""
 
 
 @dataclass(frozen=True, slots=True)
 class SessionEvent:
-    """Something that happened to a session and not to one of its frames."""
+    """An event that concerns a whole session and not one of its frames."""
 
     kind: EventKind
+    """The kind of event."""
     message: str
-    in_s: float = 0.0  # how long until it happens; 0: it has happened
+    """A sentence for a log."""
+    in_s: float = 0.0
+    """Seconds until it happens; 0: it has happened."""

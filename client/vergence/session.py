@@ -1,17 +1,20 @@
-"""One stereo stream, from the client's side: frames in, depth out."""
+"""One stereo stream from the client's side: frames in, depth out."""
 
 import asyncio
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vergence.connection import RESET, Link
-from vergence.in_flight import Flight
+from vergence.connection import RESET, StreamConnection
+from vergence.errors import NotOpen
+from vergence.in_flight import FrameInFlight, FramesInFlight
 from vergence.info import ModelInfo
-from vergence.responses import Answers
+from vergence.info_codec import model_info_from_proto
+from vergence.responses import ResponseRouter
 from vergence.results import DepthResult, Drops, SessionEvent
 from vergence.transports.base import Transport
 from vergence_proto import codec
@@ -22,84 +25,128 @@ from vergence_proto.v1 import depth_pb2 as pb
 WorldFromLeft = Pose | PoseSample | Matrix | None
 
 
-class DepthSession:
-    """Made by :meth:`vergence.DepthClient.open_session`; open inside ``async with``.
+@dataclass(frozen=True, slots=True, eq=False)
+class SessionSetup:
+    """The choices of :meth:`vergence.DepthClient.open_session`, which alone makes sessions."""
 
-    There are two ways to use it. Request and response, nothing is dropped::
+    transport: Transport
+    opening: pb.OpenStream
+    delivery: Delivery
+    encoding: ImageEncoding
+    jpeg_quality: int
+    on_event: Callable[[SessionEvent], None] | None
+
+
+class DepthSession:
+    """One stereo stream. :meth:`vergence.DepthClient.open_session` makes it; use ``async with``.
+
+    There are two ways to use a session. Request and response, where no frame is dropped::
 
         result = await session.step(left, right, world_from_left)
 
-    Live, newest wins: one task submits frames as the cameras give them, another reads::
+    Live, where the newest frame wins: one task submits frames at camera rate, another reads::
 
         session.submit(left, right, world_from_left)
 
         async for result in session:
-            show(result.depth_m)
+            print(result.depth_m.shape, result.age_s)
 
-    Images are uint8, grey [H, W] or RGB [H, W, 3], of the rig's size, and are the caller's again
-    when the method returns. A pose says where the left camera was at mid-exposure, camera to
-    world, in the session's axes; a matrix is [3, 4] or [4, 4]. Without a pose nothing is warped.
+    Images are uint8, grey [H, W] or RGB [H, W, 3], and have the size of the rig; they are copied
+    before the method returns. A pose maps left-camera to world coordinates at mid-exposure, in the
+    session's axes and metres; a matrix is [3, 4] or [4, 4]. A frame without a pose starts the
+    stream's memory again if earlier frames had poses.
 
-    Methods are for the event loop's own thread; a camera that calls back from another one hands
-    over by ``loop.call_soon_threadsafe(session.submit, left, right, world_from_left)``.
+    Call the methods in the thread of the event loop. A camera with callbacks in another thread
+    uses ``loop.call_soon_threadsafe(session.submit, left, right, world_from_left)``.
 
-    A connection that breaks is made again and the stream resumed where it stood, for as long as
-    the server keeps its state; ``on_event`` hears of it, and the next result's origin is RESUMED.
+    If the connection breaks, the session reconnects and resumes the stream, for as long as the
+    server keeps its state. ``on_event`` reports it, and the next result's origin is RESUMED.
+
+    Every method but ``__aenter__`` raises :class:`NotOpen` before ``async with``.
     """
 
-    def __init__(
-        self,
-        transport: Transport,
-        opening: pb.OpenStream,
-        *,
-        encoding: ImageEncoding,
-        jpeg_quality: int,
-        on_event: Callable[[SessionEvent], None] | None,
-    ) -> None:
-        self.stream_id = opening.stream_id
-        self._lossless = opening.delivery == codec.delivery_to_proto(Delivery.EVERY)
-        self._encoding = encoding
-        self._jpeg_quality = jpeg_quality
-        self._answers = Answers()
-        self._link = Link(transport, opening, self._answers, on_event)
+    def __init__(self, setup: SessionSetup, /) -> None:
+        self._setup = setup
+        self._in_flight = FramesInFlight()
+        self._responses = ResponseRouter(self._in_flight)
+        self._connection = StreamConnection(
+            setup.transport, setup.opening, self._responses, setup.on_event
+        )
         self._turn = asyncio.Lock()
         self._next_id = 1
 
     async def __aenter__(self) -> Self:
-        await self._link.open()
-        self._next_id = self._answers.opened.last_frame_id + 1
+        """Open the stream, or take it over with the resume token.
+
+        Raises
+        ------
+        BadCalibration
+            The server cannot use the rig, or the stream was opened with another one.
+        BadShape
+            An option is out of range, such as the iterations or the output's denominator.
+        ModelChanged
+            The server does not run the requested weights.
+        StreamExists
+            A stream of this id is open, and the resume token is not its own.
+        UnknownStream, StreamExpired
+            The stream to take over does not exist, or its state was discarded.
+        FrameTooLarge
+            The rig's images have more pixels than the server accepts.
+        StreamLimit, StateMemory, Quota
+            The server has no room for another stream.
+        Draining, NotReady
+            The server is shutting down, or is not ready yet.
+        ConnectionLost
+            The server cannot be reached, or did not answer in 5 s.
+        NotOpen
+            The session was open before; a session opens once.
+        """
+        if self._responses.opened is not None:
+            raise NotOpen("this session was opened before; make a new one with open_session()")
+        await self._connection.open()
+        self._next_id = self._opened().last_frame_id + 1
         return self
 
     async def __aexit__(self, *exc_info: object) -> None:
-        await self._link.close()
+        """End the stream; the server frees its state."""
+        await self._connection.close()
+
+    @property
+    def stream_id(self) -> str:
+        """The id of the stream on the server."""
+        return self._setup.opening.stream_id
 
     @property
     def resume_token(self) -> bytes:
-        """With the stream id, what another session needs to take this stream over."""
-        return self._answers.opened.resume_token
+        """The secret with which another session can take this stream over, by its stream id."""
+        return self._opened().resume_token
 
     @property
     def rig(self) -> RectifiedRig:
-        """The rig of every result: the one that was sent, or its rectification."""
-        return self._answers.rig
+        """The rig of every result: the one of ``open_session``, or its rectification."""
+        self._opened()
+        return self._responses.rig
 
     @property
     def model(self) -> ModelInfo:
-        return ModelInfo.from_proto(self._answers.opened.model)
+        """The model that steps this stream."""
+        return model_info_from_proto(self._opened().model)
 
     @property
     def credit(self) -> int:
-        """Frames that may be unanswered at once."""
-        return self._answers.flights.credit
+        """The number of frames that may be unanswered at once."""
+        self._opened()
+        return self._in_flight.credit
 
     @property
     def drops(self) -> Drops:
-        return self._answers.flights.drops
+        """The frames that never became a result, until now."""
+        return self._in_flight.drops
 
     @property
     def round_trip_s(self) -> float | None:
-        """Of the latest clock ping, without the time the server held it; None before the first."""
-        return self._link.round_trip_s
+        """Network time in seconds, there and back, of the latest ping; None before the first."""
+        return self._connection.round_trip_s
 
     def submit(
         self,
@@ -110,23 +157,47 @@ class DepthSession:
         capture_ns: int | None = None,
         max_age_s: float | None = None,
     ) -> int | None:
-        """Send a live frame if the credit allows, without waiting; its result comes by iteration.
+        """Send a live frame without waiting; its result comes by iteration.
 
-        Returns the frame's id, or None if it was dropped here (``drops.at_source``) because as many
-        as the credit allows are unanswered, or because the connection is being made again.
-        ``capture_ns`` is time.monotonic_ns() at mid-exposure (default: now). A frame that waits in
-        the server for longer than ``max_age_s`` is not stepped (``drops.stale``).
+        Parameters
+        ----------
+        left, right
+            uint8 [H, W] grey or [H, W, 3] RGB, of the rig's size.
+        world_from_left
+            The left camera's pose at mid-exposure; None: not known.
+        capture_ns
+            ``time.monotonic_ns()`` at mid-exposure; default: now.
+        max_age_s
+            A frame that waits in the server for longer is dropped (``drops.stale``).
 
-        Raises BadImage, BadPose: what no server would take. Raises the error that ended the stream.
+        Returns
+        -------
+        int | None
+            The frame's id. None if the frame was dropped here (``drops.at_source``), because as
+            many frames as the credit allows are unanswered, or because the connection is down.
+
+        Raises
+        ------
+        BadImage
+            An image is not uint8, or has another shape than those above.
+        BadPose
+            The pose is not finite, or its rotation is not orthonormal with determinant +1.
+        RuntimeError
+            The session's delivery is EVERY, which must not drop frames; use :meth:`step`.
+        NotOpen
+            The session is not open, or has ended.
+        DepthError
+            The error that ended the stream, such as Superseded, StreamExpired or ConnectionLost.
         """
-        if self._lossless:
+        self._opened()
+        if self._setup.delivery is Delivery.EVERY:
             raise RuntimeError("submit() may drop frames and this session is lossless: use step()")
         self._check_open()
-        if not (self._link.up and self._answers.flights.has_room):
-            self._answers.flights.count(at_source=1)
+        if not (self._connection.up and self._in_flight.has_room):
+            self._in_flight.count(at_source=1)
             return None
         request = self._request(left, right, world_from_left, capture_ns, max_age_s)
-        return self._launch(request, answer=None)
+        return self._send(request, answer=None)
 
     async def step(
         self,
@@ -136,49 +207,100 @@ class DepthSession:
         *,
         capture_ns: int | None = None,
     ) -> DepthResult:
-        """Send a frame and wait for its answer; calls that overlap go out in order.
+        """Send a frame and wait for its result; calls that overlap are sent in order.
 
-        Overlapping as many calls as the credit keeps the server busy while frames travel.
-        Raises the error of this frame, or the one that ended the stream. Raises ConnectionLost: the
-        server took the frame and the connection broke before the answer came.
+        Overlap as many calls as :attr:`credit` to keep the server busy while frames travel.
+        Parameters are those of :meth:`submit`.
+
+        Raises
+        ------
+        BadImage
+            An image is not uint8, or has another shape than [H, W] or [H, W, 3].
+        BadPose
+            The pose is not finite, or its rotation is not orthonormal with determinant +1.
+        BadShape
+            The images do not have the rig's size.
+        FrameTooLarge
+            The frame has more bytes than the server accepts.
+        FrameStale
+            Delivery is NEWEST, and a newer frame displaced this one.
+        ModelFailed, NonFinite
+            The model failed on this frame; the stream continues.
+        ConnectionLost
+            The connection broke after the server took the frame, or could not be restored.
+        NotOpen
+            The session is not open, or has ended.
+        DepthError
+            The error that ended the stream, such as Superseded, StreamExpired or UnknownStream.
         """
+        self._opened()
         answer: asyncio.Future[DepthResult] = asyncio.get_running_loop().create_future()
         async with self._turn:
-            await self._answers.flights.room()
+            await self._in_flight.wait_for_room()
             self._check_open()
             request = self._request(left, right, world_from_left, capture_ns, max_age_s=None)
-            self._launch(request, answer)
+            self._send(request, answer)
         return await answer
 
     def reset(self) -> None:
-        """Frames after this start from nothing, as after a cut in a film."""
+        """Discard the stream's memory: the next frame is a cold start, as after a cut in a film.
+
+        Raises
+        ------
+        NotOpen
+            The session is not open, or has ended.
+        DepthError
+            The error that ended the stream.
+        """
         self._check_open()
-        self._answers.reset_after = self._next_id - 1
-        self._link.send(RESET)
+        self._responses.reset_after = self._next_id - 1
+        self._connection.send(RESET)
 
     def end(self) -> None:
-        """No frame follows: iteration stops after the last answer, and the server frees the state.
+        """Announce that no frame follows; iteration stops after the last answer.
 
-        Leaving ``async with`` does this too.
+        Leaving ``async with`` does this too. A second call does nothing.
+
+        Raises
+        ------
+        NotOpen
+            The session was never open.
         """
-        self._link.end()
+        self._opened()
+        self._connection.end()
 
     def __aiter__(self) -> Self:
+        """Iterate over the results of submitted frames."""
         return self
 
     async def __anext__(self) -> DepthResult:
-        """The next result of a submitted frame; a slow reader gets the newest ones.
+        """Wait for the next result of a submitted frame; a slow reader gets the newest ones.
 
-        Raises the error of a submitted frame in its place; the stream lives on, iterate again.
-        Raises the error that ended the stream, as Superseded or StreamExpired.
+        Raises
+        ------
+        ModelFailed, NonFinite, BadShape, FrameTooLarge
+            A submitted frame failed. The stream continues: iterate again.
+        Superseded, StreamExpired, UnknownStream, ModelChanged, ConnectionLost
+            The stream ended.
+        NotOpen
+            The session was never open.
         """
-        return await self._answers.next()
+        self._opened()
+        return await self._responses.next()
+
+    def _opened(self) -> pb.StreamOpened:
+        if self._responses.opened is None:
+            raise NotOpen(
+                "the session is not open; write: async with client.open_session(rig) as session"
+            )
+        return self._responses.opened
 
     def _check_open(self) -> None:
-        if self._answers.error is not None:
-            raise self._answers.error
-        if self._link.ending:
-            raise RuntimeError("the session has ended; open a new one")
+        self._opened()
+        if self._responses.error is not None:
+            raise self._responses.error
+        if self._connection.ending:
+            raise NotOpen("the session has ended; open a new one with client.open_session()")
 
     def _request(
         self,
@@ -195,11 +317,14 @@ class DepthSession:
         capture_ns = time.monotonic_ns() if capture_ns is None else capture_ns
         frame = StereoFrame(self._next_id, capture_ns, left, right, world_from_left)
         return codec.frame_to_request(
-            frame, encoding=self._encoding, jpeg_quality=self._jpeg_quality, max_age_s=max_age_s
+            frame,
+            encoding=self._setup.encoding,
+            jpeg_quality=self._setup.jpeg_quality,
+            max_age_s=max_age_s,
         )
 
-    def _launch(self, request: bytes, answer: asyncio.Future[DepthResult] | None) -> int:
+    def _send(self, request: bytes, answer: asyncio.Future[DepthResult] | None) -> int:
         frame_id, self._next_id = self._next_id, self._next_id + 1
-        self._answers.flights.launch(Flight(frame_id, request, answer))
-        self._link.send(request)
+        self._in_flight.add(FrameInFlight(frame_id, request, answer))
+        self._connection.send(request)
         return frame_id

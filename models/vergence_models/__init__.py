@@ -1,1 +1,1 @@
-"""The science: network, data, training, evaluation, export."""
+"""The research part: networks, synthetic data, training, evaluation, export and studies."""

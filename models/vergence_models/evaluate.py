@@ -1,4 +1,4 @@
-"""``python -m vergence_models.evaluate --json FILE``: how good an exported model is, beside SGBM.
+"""``python -m vergence_models.evaluate --json FILE``: the errors of a model and of SGBM.
 
     python -m vergence_models.evaluate --json out.json --data vergence:DIR --pool pool/val
 
@@ -23,8 +23,9 @@ from vergence_models.evaluation.methods import (
     with_pose_noise,
     without_poses,
 )
-from vergence_models.evaluation.metric_accumulator import Tally, settled_frame
+from vergence_models.evaluation.metric_accumulator import MetricAccumulator, settled_frame
 from vergence_models.evaluation.metrics import SHARES_PCT
+from vergence_models.evaluation.number_format import cell, decimals
 from vergence_models.evaluation.stepping import (
     Footage,
     OnnxNetwork,
@@ -33,23 +34,23 @@ from vergence_models.evaluation.stepping import (
     footage_from_source,
 )
 from vergence_models.training.validation import filmed
-from vergence_proto.datasets import LayoutError, find_sources, open_source
+from vergence_proto.datasets import DatasetError, find_sources, open_source
 from vergence_proto.model_io import ManifestError
 
 WEIGHTS = Path(__file__).parent / "weights"
 
-Results = dict[str, dict[str, Tally]]  # group -> method -> its figures
+Results = dict[str, dict[str, MetricAccumulator]]  # group -> method -> its figures
 
 
 def methods_for(network: SteppedNetwork, *, thorough: bool) -> list[Method]:
-    """The network warm and cold, SGBM; ``thorough``: also told no motion, and noisy motion."""
+    """The network warm and cold, and SGBM; ``thorough`` adds no motion and noisy motion."""
     name, most = network.card.name, max(network.card.graphs)
     warm = warm_method(network, name, 1, cold=most)
     methods = [warm, single_frame_method(network, name, most)]
     if thorough:
         methods += [
-            warm.told("no poses", without_poses),
-            warm.told(
+            warm.with_input("no poses", without_poses),
+            warm.with_input(
                 "poses off by 0.3 deg and 1 mm",
                 lambda footage: with_pose_noise(footage, deg=0.3, m=0.001),
             ),
@@ -58,13 +59,13 @@ def methods_for(network: SteppedNetwork, *, thorough: bool) -> list[Method]:
 
 
 def footage_on_disk(sources: list[str]) -> Iterator[Footage]:
-    """Each source, as ``find_sources`` lists them. Raises LayoutError."""
+    """Each source, as ``find_sources`` lists them. Raises DatasetError."""
     for source in sources:
         yield footage_from_source(open_source(source))
 
 
 def footage_of_pool(folder: Path, clips: int) -> Iterator[Footage]:
-    """The first clips of a pool, as a camera films them. Raises FileNotFoundError."""
+    """The first clips of a pool, with camera flaws. Raises FileNotFoundError."""
     pool = ClipPool(folder)
     for index in range(min(clips, len(pool))):
         clip = filmed(pool, range(index, index + 1))
@@ -84,9 +85,11 @@ def evaluate(methods: list[Method], footages: Iterator[tuple[str, Footage]]) -> 
     """Group -> method -> its figures."""
     results: Results = {}
     for group, footage in footages:
-        tallies = results.setdefault(group, {method.label: Tally() for method in methods})
+        accumulators = results.setdefault(
+            group, {method.label: MetricAccumulator() for method in methods}
+        )
         for method in methods:
-            tallies[method.label].add(footage, method.predict(footage))
+            accumulators[method.label].add(footage, method.predict(footage))
     return results
 
 
@@ -107,21 +110,24 @@ COLUMNS = {
 }
 
 
-def figures(tally: Tally) -> dict[str, float]:
-    """The summary, and from which frame on a start has settled."""
-    settled = settled_frame(tally.epe_by_frame())
-    return tally.summary() | ({} if settled is None else {"settled": settled})
+def figures(accumulator: MetricAccumulator) -> dict[str, float]:
+    """The summary, and the frame by which a start has settled."""
+    settled = settled_frame(accumulator.epe_by_frame())
+    return accumulator.summary() | ({} if settled is None else {"settled": settled})
 
 
 def markdown(results: Results) -> str:
     """One table per group."""
     parts = []
-    for group, tallies in results.items():
+    for group, accumulators in results.items():
         lines = [f"### {group}", "", "| method | " + " | ".join(COLUMNS.values()) + " |"]
         lines.append("|---|" + "---:|" * len(COLUMNS))
-        for name, tally in tallies.items():
-            found = figures(tally)
-            cells = [f"{found[key]:.3g}" if key in found else "" for key in COLUMNS]
+        rows = {name: figures(accumulator) for name, accumulator in accumulators.items()}
+        places = {
+            key: decimals(found[key] for found in rows.values() if key in found) for key in COLUMNS
+        }
+        for name, found in rows.items():
+            cells = [cell(found.get(key), count) for key, count in places.items()]
             lines.append(f"| {name} | " + " | ".join(cells) + " |")
         parts.append("\n".join(lines))
     return "\n\n".join(parts) + "\n"
@@ -130,30 +136,30 @@ def markdown(results: Results) -> str:
 def as_json(results: Results) -> dict[str, object]:
     return {
         group: {
-            name: {**figures(tally), "epe_by_frame": tally.epe_by_frame()}
-            for name, tally in tallies.items()
+            name: {**figures(accumulator), "epe_by_frame": accumulator.epe_by_frame()}
+            for name, accumulator in accumulators.items()
         }
-        for group, tallies in results.items()
+        for group, accumulators in results.items()
     }
 
 
 def draw_plots(results: Results, folder: Path) -> None:
-    """One PNG per group: EPE against the frame's number, and how far sigma keeps its word."""
+    """One PNG per group: EPE against the frame's number, and the calibration of sigma."""
     import matplotlib as mpl
 
     mpl.use("Agg")
     from matplotlib import pyplot as plt
 
     folder.mkdir(parents=True, exist_ok=True)
-    for group, tallies in results.items():
+    for group, accumulators in results.items():
         figure, (start, trust) = plt.subplots(1, 2, figsize=(11, 4), width_ratios=(3, 2))
-        for name, tally in tallies.items():
-            epes = tally.epe_by_frame()
+        for name, accumulator in accumulators.items():
+            epes = accumulator.epe_by_frame()
             start.plot(range(1, len(epes) + 1), epes, label=name, marker="." * (len(epes) < 2))
-            summary = tally.summary()
-            told = [summary[f"within_{s}"] for s in SHARES_PCT if f"within_{s}" in summary]
-            if told:
-                trust.plot(SHARES_PCT, told, marker=".", label=name)
+            summary = accumulator.summary()
+            reported = [summary[f"within_{s}"] for s in SHARES_PCT if f"within_{s}" in summary]
+            if reported:
+                trust.plot(SHARES_PCT, reported, marker=".", label=name)
         start.set(xlabel="frame", ylabel="EPE [px]", title=group, ylim=(0, None))
         start.legend(fontsize="small")
         trust.plot((0, 100), (0, 100), color="0.7", linestyle=":")
@@ -169,7 +175,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--model", default="lite")
     parser.add_argument("--data", nargs="*", default=[], help="KIND:PATH, as vergence run takes it")
     parser.add_argument("--pool", type=Path, nargs="*", default=[], help="held-out clips")
-    parser.add_argument("--clips", type=int, default=32, help="of each pool")
+    parser.add_argument("--clips", type=int, default=32, help="clips of each pool")
     parser.add_argument("--thorough", action="store_true", help="also without and with noisy poses")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--json", type=Path, help="written with a .md of the same name beside it")
@@ -187,7 +193,7 @@ def main(arguments: list[str] | None = None) -> None:
             methods_for(network, thorough=given.thorough),
             gather(sources, given.pool, given.clips),
         )
-    except (ManifestError, LayoutError, FileNotFoundError) as error:
+    except (ManifestError, DatasetError, FileNotFoundError) as error:
         sys.exit(f"vergence_models.evaluate: {error}")
     sys.stdout.write(markdown(results))
     if given.json:

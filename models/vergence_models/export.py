@@ -23,20 +23,20 @@ import torch
 from numpy.typing import NDArray
 from onnx import ModelProto
 
-from vergence_models.config import Config, ConfigError, Kind, load_config
+from vergence_models.config import Config, ConfigError, StepKind, load_config
 from vergence_models.data.pool import ClipPool
-from vergence_models.evaluation.stepping import OnnxNetwork, SteppedNetwork
-from vergence_models.networks.base import AnyNetwork, Found
+from vergence_models.evaluation.stepping import OnnxNetwork, StepInputs, SteppedNetwork
+from vergence_models.networks.base import AnyNetwork, StepOutput
 from vergence_models.networks.lite.network import LiteNetwork
 from vergence_models.networks.raft.network import RaftNetwork
 from vergence_models.onnx_export.calibrate import make_int8
 from vergence_models.onnx_export.lite_parts import parts_of as lite_parts_of
-from vergence_models.onnx_export.modules import Part, export_part, folded
+from vergence_models.onnx_export.modules import GraphPart, export_part, folded
 from vergence_models.onnx_export.raft_parts import parts_of as raft_parts_of
 from vergence_models.onnx_export.stages import handed_on, in_stages
 from vergence_models.onnx_export.stitch import (
-    CloserLook,
-    Parts,
+    RefinementAt2x,
+    StepParts,
     stitched,
     write_with_shared_weights,
 )
@@ -71,12 +71,12 @@ def shifted_pair(
 
 
 def check_parity(
-    network: AnyNetwork, graphs: SteppedNetwork, kind: Kind, *, frames: int = 3
+    network: AnyNetwork, graphs: SteppedNetwork, kind: StepKind, *, frames: int = 3
 ) -> float:
-    """How far 99 % of pixels are from PyTorch's over a short sequence, in px.
+    """The largest difference from PyTorch among 99 % of pixels, over a short sequence, in px.
 
-    A cold kind steps the first frame; the plain one of its count goes on from the state it left.
-    Raises ParityError if that is more than :data:`PARITY_PX`.
+    A cold kind steps the first frame; the plain kind of the same count steps the others.
+    Raises ParityError if the difference is more than :data:`PARITY_PX`.
     """
     height, width = 6 * network.config.stride, 8 * network.config.stride
     state, carried = network.cold_state(1, height, width), graphs.cold_state(height, width)
@@ -87,15 +87,16 @@ def check_parity(
         pair = shifted_pair(height, width, 0, pan_px=2 * frame)
         left, right = (torch.from_numpy(image) for image in pair)
         with torch.inference_mode():
-            if kind.closer and frame == 0:
+            if kind.at_2x and frame == 0:
                 disparity, sigma, carried = graphs.start(*pair, kind.iterations)
-                expected = network.cold_step(left, right, kind.iterations, closer=kind.closer)
+                expected = network.cold_step(left, right, kind.iterations, at_2x=kind.at_2x)
             else:
-                disparity, sigma, carried = graphs.run(*pair, matrix, carried, kind.iterations)
+                inputs = StepInputs(*pair, matrix, carried)
+                disparity, sigma, carried = graphs.run(inputs, kind.iterations)
                 estimate, state = network(
                     left, right, torch.from_numpy(matrix), state, kind.iterations
                 )
-                expected = Found(estimate.disparity, estimate.sigma, state)
+                expected = StepOutput(estimate.disparity, estimate.sigma, state)
         state = expected.state
         for got, wanted in ((disparity, expected.disparity), (sigma, expected.sigma)):
             worst = max(worst, float(np.quantile(np.abs(got - wanted.numpy()), 0.99)))
@@ -114,14 +115,14 @@ def export_run(run: Run, config: Config, out: Path, *, int8_clips: ClipPool | No
     """
     network = trained_network(run)
     parts = exported_parts(network)
-    kinds = [Kind(count) for count in config.iterations]
-    kinds += [Kind(count, closer) for count, closer in config.closer.items()]
+    kinds = [StepKind(count) for count in config.iterations]
+    kinds += [StepKind(count, at_2x) for count, at_2x in config.iterations_at_2x.items()]
     models = {kind: stitched(parts, kind) for kind in kinds}
     entry: dict[str, object] = {
         "stride": run.network.stride,
         "max_disparity_px": run.network.max_disparity_px,
         "state": [dataclasses.asdict(tensor) for tensor in network.state_tensors],
-        "cold_max_pixels": config.closer_max_pixels if config.closer else 0,
+        "cold_max_pixels": config.max_pixels_at_2x if config.iterations_at_2x else 0,
         "architecture": dataclasses.asdict(run.network),
         "parameters": sum(p.numel() for p in network.parameters()),
         "training": run.story,
@@ -147,8 +148,8 @@ def export_run(run: Run, config: Config, out: Path, *, int8_clips: ClipPool | No
 def write_model(
     out: Path,
     name: str,
-    models: Mapping[Kind, ModelProto],
-    parts: Parts[ModelProto],
+    models: Mapping[StepKind, ModelProto],
+    parts: StepParts[ModelProto],
     entry: Mapping[str, object],
 ) -> None:
     """Write whole steps as the files they are served from.
@@ -172,14 +173,14 @@ def write_model(
         written = [*files]
     digests = {file: hashlib.sha256((out / file).read_bytes()).hexdigest() for file in written}
     graphs, cold_graphs = (
-        {str(kind.iterations): each for kind, each in stages.items() if bool(kind.closer) == cold}
+        {str(kind.iterations): each for kind, each in stages.items() if bool(kind.at_2x) == cold}
         for cold in (False, True)
     )
-    told = {**entry, "graphs": graphs, "cold_graphs": cold_graphs, "files": digests}
-    write_entry(out / MANIFEST_NAME, name, told)
+    complete = {**entry, "graphs": graphs, "cold_graphs": cold_graphs, "files": digests}
+    write_entry(out / MANIFEST_NAME, name, complete)
 
 
-def exported_parts(network: AnyNetwork) -> Parts[ModelProto]:
+def exported_parts(network: AnyNetwork) -> StepParts[ModelProto]:
     """The graphs that :func:`stitched` takes, batch norms folded."""
     match folded(network):
         case LiteNetwork() as lite:
@@ -189,18 +190,20 @@ def exported_parts(network: AnyNetwork) -> Parts[ModelProto]:
         case other:
             raise ConfigError(f"no parts of a {type(other).__name__}")
 
-    def exported(part: Part) -> ModelProto:
+    def exported(part: GraphPart) -> ModelProto:
         with TemporaryDirectory() as folder:
             path = Path(folder) / "part.onnx"
             export_part(part, path)
             return onnx.load(path)
 
-    look = parts.closer
-    return Parts(
+    look = parts.at_2x
+    return StepParts(
         tuple(exported(part) for part in parts.begin),
         exported(parts.iterate),
         exported(parts.end),
-        None if look is None else CloserLook(exported(look.enter), look.moved, exported(look.join)),
+        None
+        if look is None
+        else RefinementAt2x(exported(look.enter), look.moved, exported(look.join)),
     )
 
 

@@ -4,7 +4,7 @@
     python -m vergence_models.train ... --out runs/lite --resume --minutes 60
     python -m vergence_models.train --config full --batch 8 --frames 16 --workers 14 ...  # on a GPU
 
-A run can be stopped at any minute (a signal or ``--minutes``) and goes on where it was: weights,
+A run can be stopped at any minute (a signal or ``--minutes``) and continues where it was: weights,
 moving average, optimizer, step and random states are in its checkpoint.
 """
 
@@ -37,7 +37,7 @@ log = logging.getLogger("vergence_models.train")
 
 
 def train(trainer: Trainer, arguments: argparse.Namespace) -> None:
-    """The loop: step, log, save, validate, until a signal or the minutes are over."""
+    """The loop: step, log, save, validate, until a signal arrives or the minutes are over."""
     stop = False
 
     def on_signal(number: int, frame: FrameType | None) -> None:
@@ -54,14 +54,14 @@ def train(trainer: Trainer, arguments: argparse.Namespace) -> None:
     def elapsed_minutes() -> float:
         return (time.monotonic() - started) / 60
 
-    eaten = batches(
+    training_batches = batches(
         arguments.pool,
         trainer.config.training,
         first_step=trainer.progress.steps,
         workers=arguments.workers,
     )
     while not stop and elapsed_minutes() < arguments.minutes:
-        recent.append(trainer.step(next(eaten)))
+        recent.append(trainer.step(next(training_batches)))
         now = time.monotonic()
         trainer.progress.minutes += (now - last) / 60
         last = now
@@ -78,8 +78,8 @@ def train(trainer: Trainer, arguments: argparse.Namespace) -> None:
             write_line(out, {"step": trainer.progress.steps, "validation": trainer.measured})
             trainer.save(out)
             validated = saved = last = time.monotonic()
-    eaten.close()
-    trainer.save(out)  # before what takes long: whoever stops a run may not wait for it
+    training_batches.close()
+    trainer.save(out)  # before the slow validation: a stopped run may be killed during it
     if held_out is not None and trainer.progress.steps:
         trainer.measured = validate(trainer.averaged_network(), held_out, trainer.device)
         write_line(out, {"step": trainer.progress.steps, "validation": trainer.measured})
@@ -101,7 +101,7 @@ def report(out: Path, trainer: Trainer, recent: list[dict[str, float]]) -> None:
 
 
 def write_line(out: Path, values: dict[str, Any]) -> None:
-    """Append one JSON line to the run's log and say it."""
+    """Append one JSON line to the run's log and print it."""
     line = json.dumps(values)
     with (out / LOG_NAME).open("a", encoding="utf-8") as file:
         file.write(line + "\n")
@@ -115,13 +115,13 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     add("--pool", type=Path, nargs="+", required=True, help="folders of pre-rendered clips")
     add("--val", type=Path, nargs="*", default=[], help="folders of held-out clips")
     add("--out", type=Path, required=True, help="folder of the run")
-    add("--resume", action="store_true", help="go on with the run in --out")
-    add("--minutes", type=float, default=math.inf, help="of this session")
+    add("--resume", action="store_true", help="continue the run in --out")
+    add("--minutes", type=float, default=math.inf, help="stop this session after so many minutes")
     add("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    add("--workers", type=int, default=0, help="processes that make batches; 0: this one")
-    add("--log-every", type=int, default=20, help="steps")
-    add("--save-minutes", type=float, default=3)
-    add("--val-minutes", type=float, default=10)
+    add("--workers", type=int, default=0, help="processes that make batches; 0: the main process")
+    add("--log-every", type=int, default=20, help="steps between two lines of the log")
+    add("--save-minutes", type=float, default=3, help="minutes between two checkpoints")
+    add("--val-minutes", type=float, default=10, help="minutes between two validations")
     group = parser.add_argument_group("training", "fields of TrainingConfig")
     for entry in dataclasses.fields(type(CONFIGS["lite"].training)):
         kind = type(getattr(CONFIGS["lite"].training, entry.name))

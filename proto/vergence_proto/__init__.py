@@ -1,1 +1,1 @@
-"""What client, service and models must agree on: geometry, value types, errors, bytes."""
+"""The contract between client, service and models: geometry, value types, errors, the wire."""

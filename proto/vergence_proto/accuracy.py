@@ -1,8 +1,8 @@
-"""How far disparity is from the truth, by the field's definitions.
+"""Errors of disparity against the truth, by the definitions of the field.
 
-Disparities and truths are float32 [H, W] pixels, NaN in the truth where it is unknown. A pixel with
-truth and without a finite prediction counts as predicted zero: leaving hard pixels out gains
-nothing.
+Disparity and truth are float32 [H, W] pixels; the truth is NaN where it is unknown. A pixel with
+truth but without a finite prediction counts as a prediction of zero, so leaving hard pixels out
+does not reduce the error.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from vergence_proto.types import Plane
 
 Mask = NDArray[np.bool_]
 
-# Temporal error: what counts as the same surface seen again, and how many pixels make a number.
+# Temporal error: the limits for one surface seen in two frames, and the fewest pixels to report.
 _SAME_SURFACE_PX = 0.5
 _SMALLEST_DISPARITY_PX = 0.5
 _NEAREST_M = 0.05
@@ -26,20 +26,20 @@ _FEWEST_PIXELS = 50
 
 @dataclass(frozen=True, slots=True)
 class Accuracy:
-    """Errors over ``n`` pixels; all NaN where n is 0."""
+    """Errors over ``n`` pixels; all of them are NaN if n is 0."""
 
     n: int
-    epe_px: float  # end-point error: the mean absolute difference
-    d1_pct: float  # share of pixels off by more than 1 px
-    bad2_pct: float  # by more than 2 px
-    d3_pct: float  # by more than 3 px; KITTI's D1 asks for 5 % of the truth besides
-    d5_pct: float  # by more than 5 px
+    epe_px: float  # end-point error: mean absolute difference
+    d1_pct: float  # share of pixels with an error above 1 px
+    bad2_pct: float  # share of pixels with an error above 2 px
+    d3_pct: float  # share above 3 px; KITTI's D1 also requires 5 % of the truth
+    d5_pct: float  # share of pixels with an error above 5 px
 
     @classmethod
     def mean(cls, frames: Sequence[Self]) -> Self:
-        """Over the frames of a sequence, each counting the same; those without truth are left out.
+        """Average over the frames of a sequence with equal weights, without frames that lack truth.
 
-        n is the sum.
+        ``n`` is the sum over the frames.
         """
         seen = [frame for frame in frames if frame.n > 0]
         names = ("epe_px", "d1_pct", "bad2_pct", "d3_pct", "d5_pct")
@@ -51,7 +51,7 @@ class Accuracy:
 
 @dataclass(frozen=True, slots=True)
 class ErrorTail:
-    """The error that only 1, 3 and 5 % of the pixels exceed.
+    """The errors that only 1, 3 and 5 % of the pixels exceed.
 
     Stereo Matching in Time (WACV 2024) prints them as "bad 1 %, 3 %, 5 %"; its columns show that
     they are percentiles and not means.
@@ -64,15 +64,15 @@ class ErrorTail:
 
 @dataclass(frozen=True, slots=True)
 class TemporalAccuracy:
-    """Flicker over ``n`` pixels; NaN where there are too few to say."""
+    """Flicker over ``n`` pixels; NaN if there are too few pixels."""
 
     n: int
     tepe_px: float  # mean absolute error of the change in disparity along the true motion
-    t1_pct: float  # share of pixels where it exceeds 1 px
+    t1_pct: float  # share of pixels where that error exceeds 1 px
 
 
 def accuracy(disparity_px: Plane, truth_px: Plane, mask: Mask | None = None) -> Accuracy:
-    """Compare with the truth where it is known, and ``mask`` (bool [H, W]) allows."""
+    """Compare with the truth where it is known and ``mask`` (bool [H, W]) is true."""
     errors = _errors(disparity_px, truth_px, mask)
     return Accuracy(
         n=errors.size,
@@ -85,7 +85,7 @@ def accuracy(disparity_px: Plane, truth_px: Plane, mask: Mask | None = None) -> 
 
 
 def error_tail(disparity_px: Plane, truth_px: Plane, mask: Mask | None = None) -> ErrorTail:
-    """Compare as :func:`accuracy` does."""
+    """Return high percentiles of the error, over the pixels that :func:`accuracy` uses."""
     errors = _errors(disparity_px, truth_px, mask)
     if errors.size == 0:
         return ErrorTail(np.nan, np.nan, np.nan)

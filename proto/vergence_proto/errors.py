@@ -1,21 +1,21 @@
-"""Everything a caller can be told about, as one closed family.
+"""All errors that a caller can receive, as one closed family.
 
 ::
 
     DepthError
     |-- BadImage, BadPose, BadShape, BadCalibration      the request is wrong
-    |-- UnknownStream, StreamExpired                     there is no such stream (any more)
-    |-- StreamExists, Superseded                         somebody else has it
-    |-- FrameOutOfOrder, ModelChanged                    not in this state of the stream
-    |-- StreamLimit, StateMemory, Quota, FrameTooLarge   more than the server gives
+    |-- UnknownStream, StreamExpired                     the stream does not exist, or no longer
+    |-- StreamExists, Superseded                         another client has the stream
+    |-- FrameOutOfOrder, ModelChanged                    the stream's state does not allow it
+    |-- StreamLimit, StateMemory, Quota, FrameTooLarge   a limit of the server is exceeded
     |-- FrameStale                                       too late to be useful
-    |-- BadSequence, UploadTooLarge                      a whole sequence cannot be taken
-    |-- UnknownSequence, SequenceNotDone, QueueFull      its job is not there, or not yet
-    |-- Draining, NotReady                               not now: try again, or elsewhere
+    |-- BadSequence, UploadTooLarge                      an uploaded sequence is refused
+    |-- UnknownSequence, SequenceNotDone, QueueFull      the job or its result is not available
+    |-- Draining, NotReady                               not now: try again, or on another server
     `-- ModelFailed, NonFinite                           the server's own failure
 
-There is one class per :class:`ErrorCode`. The code crosses the wire with the message and the SDK
-raises the class that the server raised. A message says what was expected, what came, what to do.
+There is one class per :class:`ErrorCode`. The wire carries the code and the message, and the SDK
+raises the same class as the server. A message states what was expected, what came, and what to do.
 """
 
 from enum import StrEnum
@@ -55,9 +55,12 @@ ERROR_DOMAIN = "vergence"  # google.rpc.ErrorInfo.domain
 
 
 class DepthError(Exception):
-    """Base of all a caller can be told about; ``retry_after_s`` is set where waiting helps."""
+    """Base class of all errors that a caller can receive."""
 
     code: ClassVar[ErrorCode]
+    """The error's code on the wire."""
+    retry_after_s: float | None
+    """Seconds after which a new attempt may succeed; None if waiting does not help."""
 
     def __init__(self, message: str, *, retry_after_s: float | None = None) -> None:
         super().__init__(message)
@@ -89,19 +92,19 @@ class BadCalibration(DepthError):
 
 
 class UnknownStream(DepthError):
-    """No stream of this id is open, and none was in the last minutes."""
+    """No stream with this id is open, and none was open in the last minutes."""
 
     code = ErrorCode.STREAM_UNKNOWN
 
 
 class StreamExpired(DepthError):
-    """The stream was open, was left idle or detached too long, and its state is gone."""
+    """The stream was idle or detached for too long, and the server has deleted its state."""
 
     code = ErrorCode.STREAM_EXPIRED
 
 
 class StreamExists(DepthError):
-    """A stream of this id is open and the request carried no resume token for it."""
+    """A stream with this id is open, and the request has no resume token for it."""
 
     code = ErrorCode.STREAM_EXISTS
 
@@ -113,19 +116,19 @@ class Superseded(DepthError):
 
 
 class FrameOutOfOrder(DepthError):
-    """The frame's id is not above that of the last frame accepted on this stream."""
+    """The frame's id is not above the id of the last frame that this stream accepted."""
 
     code = ErrorCode.FRAME_OUT_OF_ORDER
 
 
 class ModelChanged(DepthError):
-    """The server runs other weights than the stream's; open a new stream to go on with them."""
+    """The server runs other weights than the stream's; to use them, open a new stream."""
 
     code = ErrorCode.MODEL_CHANGED
 
 
 class StreamLimit(DepthError):
-    """The server holds as many streams as it is configured to."""
+    """The server has as many open streams as its configuration allows."""
 
     code = ErrorCode.STREAM_LIMIT
 
@@ -137,7 +140,7 @@ class StateMemory(DepthError):
 
 
 class Quota(DepthError):
-    """The caller sends more than its share."""
+    """The caller sends more than its credit or quota allows."""
 
     code = ErrorCode.QUOTA
 
@@ -149,61 +152,61 @@ class FrameTooLarge(DepthError):
 
 
 class FrameStale(DepthError):
-    """The frame waited longer than its maximum age; the state was not touched."""
+    """The frame waited longer than its maximum age; the stream's state is unchanged."""
 
     code = ErrorCode.FRAME_STALE
 
 
 class Draining(DepthError):
-    """The server is shutting down and takes no new streams; try another one."""
+    """The server is shutting down and accepts no new streams; try another server."""
 
     code = ErrorCode.DRAINING
 
 
 class NotReady(DepthError):
-    """The server is starting, or cannot be reached."""
+    """The server is starting, or it cannot be reached."""
 
     code = ErrorCode.NOT_READY
 
 
 class ModelFailed(DepthError):
-    """The model raised; the stream is as it was before the frame."""
+    """The model failed; the stream's state is as it was before the frame."""
 
     code = ErrorCode.MODEL_FAILED
 
 
 class NonFinite(DepthError):
-    """The model's result was not finite; the frame was dropped and the stream starts anew."""
+    """The model's result was not finite; the frame has no result and the stream starts cold."""
 
     code = ErrorCode.NON_FINITE
 
 
 class BadSequence(DepthError):
-    """An upload does not unpack, or what it holds is no sequence in a layout that is read."""
+    """An upload does not unpack, or it holds no sequence of a supported data set."""
 
     code = ErrorCode.BAD_SEQUENCE
 
 
 class UploadTooLarge(DepthError):
-    """An upload is larger than allowed, as it travels or once it is unpacked."""
+    """An upload is larger than allowed, packed or unpacked."""
 
     code = ErrorCode.UPLOAD_TOO_LARGE
 
 
 class UnknownSequence(DepthError):
-    """There is no job of this id: it never was, was deleted, or its results have expired."""
+    """There is no job with this id: none was created, or it was deleted or has expired."""
 
     code = ErrorCode.SEQUENCE_UNKNOWN
 
 
 class SequenceNotDone(DepthError):
-    """The job has no results: it waits, runs, or failed."""
+    """The job has no results: it is waiting or running, or it has failed."""
 
     code = ErrorCode.SEQUENCE_NOT_DONE
 
 
 class QueueFull(DepthError):
-    """As many sequences wait as may, or there is no room on disk for another one."""
+    """The queue of sequences is full, or the disk has no room for another sequence."""
 
     code = ErrorCode.QUEUE_FULL
 
@@ -214,7 +217,10 @@ ERROR_CLASSES: dict[ErrorCode, type[DepthError]] = {
 
 
 def error_from_wire(reason: str, message: str, retry_after_s: float | None = None) -> DepthError:
-    """The error the other side raised; an unknown reason (a newer server) becomes ModelFailed."""
+    """Return the error that the server raised; an unknown reason becomes ModelFailed.
+
+    A newer server may have reasons that this version does not know.
+    """
     known = reason in ErrorCode.__members__
     error_class = ERROR_CLASSES[ErrorCode(reason)] if known else ModelFailed
     return error_class(message if known else f"{reason}: {message}", retry_after_s=retry_after_s)

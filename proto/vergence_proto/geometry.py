@@ -12,29 +12,79 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from vergence_proto.errors import BadCalibration, BadPose
+
 Matrix = NDArray[np.float64]
+
+# Rounding to float32 and a few multiplications change a rotation by much less than this.
+_RIGID_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:
-    """A rigid transform, float64. Variables that hold one are named ``a_from_b``."""
+    """A rigid transform ``p_a = rotation @ p_b + translation_m``, in float64.
 
-    rotation: Matrix  # [3, 3], det +1
-    translation_m: Matrix  # [3]
+    Variables that hold a pose are named ``a_from_b``: it maps b-coordinates to a-coordinates. The
+    constructor stores its arguments and checks nothing.
+    """
+
+    rotation: Matrix
+    """Float64 [3, 3], orthonormal, determinant +1."""
+    translation_m: Matrix
+    """Float64 [3], metres: the origin of b in a-coordinates."""
 
     @classmethod
     def identity(cls) -> Self:
+        """Return the pose that changes nothing."""
         return cls(np.eye(3), np.zeros(3))
 
     @classmethod
     def from_matrix(cls, matrix: Matrix) -> Self:
-        """From [3, 4] or [4, 4] row-major, rotation left of translation."""
-        matrix = np.asarray(matrix, np.float64)
-        return cls(matrix[:3, :3].copy(), matrix[:3, 3].copy())
+        """Make a pose of a [3, 4] or [4, 4] row-major matrix, rotation left of translation.
+
+        The input is converted to float64 and copied.
+
+        Raises
+        ------
+        BadPose
+            The matrix has another shape, is not made of numbers, or its last row is not 0 0 0 1
+            within 0.001. A session refuses a matrix that is scaled, sheared, mirrored or not
+            finite when it is sent.
+        """
+        values = _float64(matrix, "a [3, 4] or [4, 4] matrix")
+        if values.shape not in ((3, 4), (4, 4)):
+            raise BadPose(
+                f"expected a [3, 4] or [4, 4] matrix, got shape {list(values.shape)}; "
+                "put the rotation left of the translation"
+            )
+        rotation, translation_m = values[:3, :3].copy(), values[:3, 3].copy()
+        if len(values) == 4 and not np.abs(values[3] - (0, 0, 0, 1)).max() <= _RIGID_TOLERANCE:
+            raise BadPose(
+                f"expected 0 0 0 1 as the last row, got {values[3].tolist()}; "
+                "a pose is row-major: a matrix of a graphics library may have to be transposed"
+            )
+        return cls(rotation, translation_m)
 
     @classmethod
     def from_xyzw(cls, orientation_xyzw: Matrix, translation_m: Matrix) -> Self:
-        """From a quaternion (Hamilton, scalar last, any non-zero length) and a translation [3]."""
+        """Make a pose of a quaternion [4] and a translation [3] in metres.
+
+        The quaternion is Hamilton's, scalar last, of any non-zero length.
+
+        Raises
+        ------
+        BadPose
+            A shape is another one, a number is not finite, or the quaternion is zero.
+        """
+        for name, values, size in (
+            ("quaternion x y z w", orientation_xyzw, 4),
+            ("translation x y z", translation_m, 3),
+        ):
+            numbers = _float64(values, f"a {name}")
+            if numbers.shape != (size,) or not np.isfinite(numbers).all():
+                raise BadPose(f"expected a {name} of {size} finite numbers, got {numbers.tolist()}")
+        if not np.any(orientation_xyzw):
+            raise BadPose("expected a quaternion x y z w of non-zero length, got zeros")
         x, y, z, w = np.asarray(orientation_xyzw, np.float64) / np.linalg.norm(orientation_xyzw)
         rotation = np.array(
             [
@@ -47,7 +97,7 @@ class Pose:
 
     @property
     def orientation_xyzw(self) -> Matrix:
-        """The unit quaternion [4], scalar last and non-negative."""
+        """The rotation as a unit quaternion, float64 [4], scalar last and non-negative."""
         r = self.rotation
         # The four squared components (times four) from the diagonal; starting from the largest
         # one keeps the division well conditioned (Shepperd 1978).
@@ -70,24 +120,26 @@ class Pose:
 
     @property
     def matrix(self) -> Matrix:
-        """Homogeneous [4, 4]."""
+        """The pose as a homogeneous matrix, float64 [4, 4], row-major."""
         matrix = np.eye(4)
         matrix[:3, :3] = self.rotation
         matrix[:3, 3] = self.translation_m
         return matrix
 
     def __matmul__(self, other: "Pose") -> "Pose":
+        """Compose two poses: ``a_from_c = a_from_b @ b_from_c``."""
         return Pose(
             self.rotation @ other.rotation,
             self.rotation @ other.translation_m + self.translation_m,
         )
 
     def inverse(self) -> "Pose":
+        """Return ``b_from_a``: the pose that undoes this one."""
         back = self.rotation.T
         return Pose(back, -back @ self.translation_m)
 
     def apply(self, points_b: Matrix) -> Matrix:
-        """Map points [..., 3] from b-coordinates to a-coordinates."""
+        """Map points [..., 3] in metres from b-coordinates to a-coordinates."""
         return points_b @ self.rotation.T + self.translation_m
 
 
@@ -98,13 +150,17 @@ class Axes(Enum):
     signed permutations; Unity's has determinant -1, because Unity is left-handed.
     """
 
-    OPENCV = ((1, 0, 0), (0, 1, 0), (0, 0, 1))  # x right, y down, z forward
-    OPENXR = ((1, 0, 0), (0, -1, 0), (0, 0, -1))  # x right, y up, z back
-    UNITY = ((1, 0, 0), (0, -1, 0), (0, 0, 1))  # x right, y up, z forward
-    NED = ((0, 1, 0), (0, 0, 1), (1, 0, 0))  # x forward, y right, z down
+    OPENCV = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+    """x right, y down, z forward."""
+    OPENXR = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
+    """x right, y up, z back; the axes of OpenXR and OpenGL."""
+    UNITY = ((1, 0, 0), (0, -1, 0), (0, 0, 1))
+    """x right, y up, z forward; left-handed."""
+    NED = ((0, 1, 0), (0, 0, 1), (1, 0, 0))
+    """x forward, y right, z down; the axes of aircraft and drones."""
 
     def to_opencv(self, pose: Pose) -> Pose:
-        """The same motion, stated in OpenCV axes."""
+        """Convert a pose stated in these axes to OpenCV axes; the motion is the same."""
         opencv_from_self = np.array(self.value, np.float64)
         return Pose(
             opencv_from_self @ pose.rotation @ opencv_from_self.T,
@@ -112,7 +168,7 @@ class Axes(Enum):
         )
 
     def from_opencv(self, pose: Pose) -> Pose:
-        """The inverse of :meth:`to_opencv`."""
+        """Convert a pose stated in OpenCV axes to these axes; undoes :meth:`to_opencv`."""
         self_from_opencv = np.array(self.value, np.float64).T
         return Pose(
             self_from_opencv @ pose.rotation @ self_from_opencv.T,
@@ -122,36 +178,78 @@ class Axes(Enum):
 
 @dataclass(frozen=True, slots=True)
 class RectifiedRig:
-    """A rectified pair: rows correspond, both cameras share focal lengths and cy."""
+    """A rectified camera pair: rows correspond, both cameras share focal lengths and ``cy``.
+
+    Pixel centres sit at integer coordinates. The right camera is ``baseline_m`` to the right of the
+    left one.
+
+    Raises
+    ------
+    BadCalibration
+        A size, focal length or baseline is not positive, or a number is not finite.
+    """
 
     width: int
+    """Width of both images in pixels."""
     height: int
-    fx: float  # pixels
+    """Height of both images in pixels."""
+    fx: float
+    """Horizontal focal length of both cameras in pixels."""
     fy: float
-    cx_left: float  # pixels; pixel centres sit at integer coordinates
+    """Vertical focal length of both cameras in pixels."""
+    cx_left: float
+    """Column of the left camera's principal point in pixels."""
     cx_right: float
+    """Column of the right camera's principal point in pixels."""
     cy: float
+    """Row of both principal points in pixels."""
     baseline_m: float
+    """Distance between the camera centres in metres."""
+
+    def __post_init__(self) -> None:
+        if not (self.width > 0 and self.height > 0):
+            raise BadCalibration(f"image size must be positive, got {self.width}x{self.height}")
+        if not (0 < self.fx < np.inf and 0 < self.fy < np.inf):
+            raise BadCalibration(
+                f"focal lengths must be positive pixels, got fx={self.fx} fy={self.fy}"
+            )
+        centres = (self.cx_left, self.cx_right, self.cy)
+        if not np.isfinite(centres).all():
+            raise BadCalibration(f"principal points must be finite, got {centres}")
+        if not 0 < self.baseline_m < np.inf:
+            raise BadCalibration(
+                f"the baseline must be a positive length in metres, got {self.baseline_m}; "
+                "the right camera must be to the right of the left one"
+            )
 
     @property
     def offset_of_zero_disparity_px(self) -> float:
-        """u_left - u_right of a point at infinity; Middlebury's ``doffs`` is its negative."""
+        """``u_left - u_right`` in pixels of a point at infinity: ``cx_left - cx_right``.
+
+        Middlebury's ``doffs`` is the negative of it.
+        """
         return self.cx_left - self.cx_right
 
     def depth_from_disparity(self, disparity_px: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Z = fx * baseline / d, metres along the optical axis; NaN where d is not positive."""
+        """Compute depth ``Z = fx * baseline_m / d`` in metres along the optical axis.
+
+        Takes and returns float32 [H, W]. The result is NaN where the disparity is not positive.
+        """
         positive = disparity_px > 0
         safe = np.where(positive, disparity_px, np.float32(1))
         depth = np.float32(self.fx * self.baseline_m) / safe
         return np.where(positive, depth, np.float32(np.nan))
 
     def disparity_from_depth(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """D = fx * baseline / Z, pixels; NaN where the depth is not positive."""
+        """Compute disparity ``d = fx * baseline_m / Z`` in pixels.
+
+        Takes and returns float32 [H, W]. The result is NaN where the depth is not positive.
+        """
         return self.depth_from_disparity(depth_m)  # the map is its own inverse
 
     @property
     def xyzw_from_uvd(self) -> Matrix:
-        """Q [4, 4]: (u, v, u_left - u_right, 1) to homogeneous left-camera metres."""
+        """Q, float64 [4, 4]: maps (u, v, u_left - u_right, 1) to homogeneous left-camera metres."""
         return np.array(
             [
                 [1, 0, 0, -self.cx_left],
@@ -165,12 +263,36 @@ class RectifiedRig:
 def uvd_curr_from_prev(
     rig: RectifiedRig, curr_from_prev: Pose, prev_rig: RectifiedRig | None = None
 ) -> NDArray[np.float32]:
-    """How a rigid motion of the camera moves pixels and disparities: float32 [4, 4].
+    """Return the float32 [4, 4] by which a rigid camera motion moves pixels and disparities.
 
-    Takes homogeneous (u, v, u_left - u_right, 1) of the previous frame to the current one:
+    It takes homogeneous (u, v, u_left - u_right, 1) of the previous frame to the current one:
     ``Q^-1 [RT]_{curr<-prev} Q``. Stereo Matching in Time (WACV 2024, section 3.2) prints the
     product the other way round, which does not fit the Q it defines. Composed in float64.
     """
     uvd_from_xyzw = np.linalg.inv(rig.xyzw_from_uvd)
     transform = uvd_from_xyzw @ curr_from_prev.matrix @ (prev_rig or rig).xyzw_from_uvd
     return transform.astype(np.float32)
+
+
+def check_rotation(rotation: Matrix) -> None:
+    """Accept a float64 [3, 3] that is a rotation.
+
+    Raises BadPose: it has another shape, is not finite, or is not orthonormal with determinant +1,
+    within 0.001.
+    """
+    if rotation.shape == (3, 3) and np.isfinite(rotation).all():
+        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        if error <= _RIGID_TOLERANCE and np.linalg.det(rotation) > 0:
+            return
+    raise BadPose(
+        f"expected a rotation [3, 3], finite, orthonormal, of determinant +1, got "
+        f"{rotation.tolist()}; remove scale and shear, and state left-handed poses by the axes of "
+        "the session and not by a mirrored matrix"
+    )
+
+
+def _float64(values: object, expected: str) -> Matrix:
+    try:
+        return np.asarray(values, np.float64)
+    except (TypeError, ValueError):
+        raise BadPose(f"expected {expected} of numbers, got {str(values)[:200]}") from None

@@ -1,14 +1,14 @@
-"""A StreamDepth call over HTTP, which has no messages: two kinds of request and one long answer.
+"""StreamDepth over HTTP: one long response of records, and one request per message.
 
 ::
 
-    POST /v1/streams            StreamDepthRequest with ``open``; the answer lasts as long as the
-                                call and is made of records
-    POST /v1/streams/{call}     StreamDepthRequest with anything else; ``call`` is what the answer's
-                                header X-Call-Id says, which nobody else can know
+    POST /v1/streams            StreamDepthRequest with ``open``; the response lasts as long as the
+                                call and consists of records
+    POST /v1/streams/{call}     every other StreamDepthRequest; ``call`` is a secret, sent in the
+                                header X-Call-Id of the response to the first request
     POST /v1/methods/{method}   the other methods of DepthService
 
-A record is one byte that says its kind, four with the length (big-endian), and the content.
+A record is one byte with its kind, four bytes with its length (big-endian), and the content.
 """
 
 import struct
@@ -23,23 +23,28 @@ _HEAD = struct.Struct(">BI")
 
 
 class RecordKind(IntEnum):
-    MESSAGE = 0  # a StreamDepthResponse
-    END = 1  # of the call: empty in peace, else a FrameError that says why
+    """The kind of a record, its first byte."""
+
+    MESSAGE = 0
+    """A StreamDepthResponse."""
+    END = 1
+    """The end of the call: empty after success, else a FrameError with the reason."""
 
 
 def pack_record(kind: RecordKind, content: bytes) -> bytes:
+    """Return the bytes of one record."""
     return _HEAD.pack(kind, len(content)) + content
 
 
 class RecordReader:
-    """Puts records together from the pieces in which they arrive."""
+    """Assembles records from the chunks in which they arrive."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
 
-    def feed(self, piece: bytes) -> Iterator[tuple[RecordKind, bytes]]:
-        """The records that ``piece`` completes. Raises ValueError: no such kind."""
-        self._buffer += piece
+    def feed(self, chunk: bytes) -> Iterator[tuple[RecordKind, bytes]]:
+        """Yield the records that ``chunk`` completes. Raises ValueError: there is no such kind."""
+        self._buffer += chunk
         while len(self._buffer) >= _HEAD.size:
             kind, length = _HEAD.unpack_from(self._buffer)
             end = _HEAD.size + length

@@ -1,7 +1,7 @@
 """The best instruction set of this machine's CPU for products of bytes.
 
-It decides which int8 kernels an engine takes, and so how long a step takes. It does not change an
-answer. Times of two machines can only be compared beside it.
+It decides which int8 kernels an inference engine uses, and so how long a step takes. It does not
+change the result. State it beside every time that is compared with another machine's.
 """
 
 import platform
@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 
 UNKNOWN = "unknown"
-# From the best to the least, each by the names that Linux and macOS have for the feature.
+# From the best to the least, with the names of the feature in Linux and in macOS.
 _NAMES = {
     "AVX-512-VNNI": ("avx512_vnni", "avx512vnni"),
     "AVX-VNNI": ("avx_vnni", "avxvnni"),
@@ -26,22 +26,23 @@ _CPUINFO = Path("/proc/cpuinfo")
 
 @cache
 def instruction_set() -> str:
-    """Its name, such as "AVX2", or "unknown" where the system does not say."""
+    """Return its name, such as "AVX2", or "unknown" if the system does not report it."""
     match sys.platform:
         case "linux":
             return best_of(linux_features(_CPUINFO.read_text("utf-8", errors="replace")))
         case "darwin":
             return best_of(macos_features(_sysctl()))
         case _:
-            return UNKNOWN  # Windows tells of AVX2 and AVX-512, but not of VNNI
+            return UNKNOWN  # Windows reports AVX2 and AVX-512, but not VNNI
 
 
 def best_of(features: Collection[str]) -> str:
+    """Return the best instruction set that the features of a CPU include."""
     return next((name for name, words in _NAMES.items() if set(words) & {*features}), UNKNOWN)
 
 
 def linux_features(cpuinfo: str) -> set[str]:
-    """The features of the first CPU that /proc/cpuinfo lists."""
+    """Return the features of the first CPU in the text of /proc/cpuinfo."""
     for line in cpuinfo.splitlines():
         key, _, value = line.partition(":")
         if key.strip().lower() in ("flags", "features"):
@@ -50,7 +51,7 @@ def linux_features(cpuinfo: str) -> set[str]:
 
 
 def macos_features(sysctl: str) -> set[str]:
-    """The features in lines of ``sysctl``: "machdep.cpu.features: SSE ..." or "NAME: 1"."""
+    """Return the features in lines of ``sysctl``: "machdep.cpu.features: SSE ..." or "NAME: 1"."""
     found: set[str] = set()
     for line in sysctl.lower().splitlines():
         key, _, value = line.partition(":")

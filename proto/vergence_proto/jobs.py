@@ -1,10 +1,10 @@
-"""What client and server both say about jobs: whole sequences that are sent over HTTP."""
+"""Names that client and server share for jobs: whole sequences that are uploaded over HTTP."""
 
 from enum import StrEnum
 
 
 class JobState(StrEnum):
-    """The state of a job, as the HTTP API writes it."""
+    """The state of a job, in the words of the HTTP API."""
 
     QUEUED = "queued"
     RUNNING = "running"
@@ -13,7 +13,7 @@ class JobState(StrEnum):
 
     @property
     def ended(self) -> bool:
-        """Whether the job is finished, with or without success."""
+        """True once the job is finished, with or without success."""
         return self in (JobState.DONE, JobState.FAILED)
 
 
@@ -36,4 +36,4 @@ class ResultFormat(StrEnum):
     NPZ = "npz"
     """One NumPy archive per frame."""
     MP4 = "mp4"
-    """A film of coloured disparity, for viewing only."""
+    """A video of coloured disparity, for viewing only."""

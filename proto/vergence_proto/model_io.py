@@ -1,20 +1,21 @@
-"""The contract between whoever exports a network and whoever serves it.
+"""The contract between the export of a network and the server that runs it.
 
-A model is a set of ONNX graphs over the same weights, and a manifest that describes them. One
-step of the recurrence, for a batch of streams, runs the graphs of its iteration count in stages.
-The graphs of a stage do not need each other and may run side by side; each takes, by name, what
-the caller gives or what a graph of an earlier stage gave. Any graph may give an output of the
-model, and no two graphs of a count give the same name. Most models have a single graph per count:
-one stage of one graph. A model may start a stream in another way than it goes on: cold graphs take
-the place of the others where there is no state, at the counts that they are there for, in images
-that are not too large for them.
+A model is a set of ONNX graphs with the same weights, and a manifest that describes them. One step
+of the recurrence, for a batch of streams, runs the graphs of its iteration count in stages. The
+graphs of one stage are independent and may run in parallel. The inputs of a graph are named; each
+comes from the caller or is an output of an earlier stage. Any graph may return an output of the
+model, and no two graphs of a count have an output of the same name. Most models have a single graph
+per count: one stage of one graph.
+
+A model may have separate graphs for cold starts. They are used when there is no state, for the
+iteration counts listed, up to their maximum image size.
 
 Inputs:
 
 - ``left``, ``right``: uint8 [B, H, W, 3], rectified RGB; H and W as :meth:`ModelCard.step_size`.
-- ``uvd_curr_from_prev``: float32 [B, 4, 4], pixels of the previous frame to pixels of this one;
+- ``uvd_curr_from_prev``: float32 [B, 4, 4], from the pixels of the previous frame to this one's;
   see :func:`vergence_proto.geometry.uvd_curr_from_prev`.
-- ``prev_<tensor>``: float32 [B, C, h, w], the state the previous step left; zeros on a cold start.
+- ``prev_<tensor>``: float32 [B, C, h, w], the state after the previous step; zeros on a cold start.
 
 Outputs:
 
@@ -22,8 +23,8 @@ Outputs:
 - ``sigma``: float32 [B, H, W], its expected absolute error, in pixels.
 - ``next_<tensor>``: float32 [B, C, h, w], the state for the next step.
 
-Pixel centres sit at integer coordinates. The matched quantity is the raw pixel offset, also where
-the two principal points differ: the transform carries that difference.
+Pixel centres are at integer coordinates. The network predicts the raw pixel offset, even if the
+two principal points differ: the transform includes that difference.
 """
 
 import hashlib
@@ -46,12 +47,12 @@ SIGMA = "sigma"
 MANIFEST_NAME = "manifest.json"
 MANIFEST_FORMAT = 2
 
-Stage = tuple[Path, ...]  # graphs that may run side by side
+Stage = tuple[Path, ...]  # graphs that may run in parallel
 Stages = tuple[Stage, ...]  # one step, in the order in which its stages run
 
 
 class ManifestError(ValueError):
-    """A manifest or a file it names is missing, damaged, of another format, or does not fit."""
+    """A manifest or one of its files is missing, damaged, of another format, or does not match."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,21 +77,22 @@ class StateTensor:
 
 @dataclass(frozen=True, slots=True)
 class ModelCard:
-    """What the manifest says about one model."""
+    """The manifest's description of one model."""
 
     name: str
-    stride: int  # H and W of a step are multiples of it
+    stride: int  # height and width of a step are multiples of this number
     max_disparity_px: int
     state: tuple[StateTensor, ...]
-    graphs: Mapping[int, Stages]  # by iterations
-    weights_sha256: str  # of all files together: the identity told to clients
-    cold_graphs: Mapping[int, Stages] = field(default_factory=dict)  # by iterations; may be none
-    cold_max_pixels: int = 0  # of an image, as it is stepped: larger ones start as they go on
+    graphs: Mapping[int, Stages]  # the stages of a step, by number of iterations
+    weights_sha256: str  # hash of all files together; clients see it as the identity of the weights
+    # The stages of a cold start, by number of iterations; empty if they are those of any step.
+    cold_graphs: Mapping[int, Stages] = field(default_factory=dict)
+    cold_max_pixels: int = 0  # larger images, at step size, start with the graphs of any step
 
     def stages(self, iterations: int, *, cold_pixels: int | None = None) -> Stages:
-        """The graphs of a step; ``cold_pixels``, of its images, if it is a stream's first.
+        """Return the graphs of a step. For a stream's first, ``cold_pixels`` is its image's size.
 
-        Raises KeyError: no such count.
+        Raises KeyError: the model has no graphs for this number of iterations.
         """
         usual = self.graphs[iterations]
         if cold_pixels is None or cold_pixels > self.cold_max_pixels:
@@ -99,21 +101,21 @@ class ModelCard:
 
     @property
     def all_stages(self) -> tuple[Stage, ...]:
-        """Of every step there is."""
+        """The stages of every kind of step."""
         return tuple(chain(*self.graphs.values(), *self.cold_graphs.values()))
 
     @property
     def input_names(self) -> tuple[str, ...]:
-        """What the caller of a step gives."""
+        """The names of a step's inputs."""
         return LEFT, RIGHT, UVD_CURR_FROM_PREV, *(tensor.input_name for tensor in self.state)
 
     @property
     def output_names(self) -> tuple[str, ...]:
-        """What the caller of a step gets."""
+        """The names of a step's outputs."""
         return DISPARITY, SIGMA, *(tensor.output_name for tensor in self.state)
 
     def step_size(self, height: int, width: int) -> tuple[int, int]:
-        """The size [H, W] that images are grown to: whole strides, every disparity inside."""
+        """Return the padded size [H, W]: whole strides, and wide enough for every disparity."""
         rows, columns = (
             -(-height // self.stride),
             -(-max(width, self.max_disparity_px) // self.stride),
@@ -121,7 +123,7 @@ class ModelCard:
         return rows * self.stride, columns * self.stride
 
     def grown(self, image: Image) -> Image:
-        """``image`` at its step size: edges repeated to the right and below, no pixel moves."""
+        """Pad ``image`` to its step size. Edges are repeated right and below; no pixel moves."""
         height, width = image.shape[:2]
         step_height, step_width = self.step_size(height, width)
         if (step_height, step_width) == (height, width):
@@ -130,7 +132,7 @@ class ModelCard:
         return np.pad(image, around, mode="edge")
 
     def iterations_at_most(self, wanted: int) -> int:
-        """The largest exported count that does not exceed ``wanted`` (at least the smallest)."""
+        """Return the largest exported count up to ``wanted``, or the smallest if all exceed it."""
         fitting = [count for count in self.graphs if count <= wanted]
         return max(fitting) if fitting else min(self.graphs)
 
@@ -138,8 +140,8 @@ class ModelCard:
 def load_model_card(weights_dir: Path, name: str) -> ModelCard:
     """Read one model's card from ``weights_dir`` and check its files against their sha256.
 
-    Raises ManifestError: file missing or without a sha256, unknown format, unknown model, or a
-    hash that differs.
+    Raises ManifestError: a file is missing or has no sha256 or another one, the manifest has an
+    unknown format, or there is no such model.
     """
     path = weights_dir / MANIFEST_NAME
     try:
@@ -156,10 +158,10 @@ def load_model_card(weights_dir: Path, name: str) -> ModelCard:
     if name not in models:
         raise ManifestError(
             f"{path} has no model {name!r}; it has {', '.join(sorted(models))}. "
-            "Name the folder that another was exported to"
+            "For another model, name the folder that it was exported to"
         )
     entry = models[name]
-    # The graphs, and what large networks keep beside them because their graphs have it in common.
+    # The graphs, and the weights that several graphs of a large network share.
     files = entry["files"]
     digests = [_checked_digest(weights_dir / file, files[file]) for file in sorted(files)]
     graphs, cold_graphs = (
@@ -174,7 +176,7 @@ def load_model_card(weights_dir: Path, name: str) -> ModelCard:
             if graph.name not in files:
                 raise ManifestError(
                     f"{path}: model {name!r} runs {graph.name}, which is not among its files; "
-                    "export the model anew"
+                    "export the model again"
                 )
     return ModelCard(
         name=name,
@@ -196,6 +198,6 @@ def _checked_digest(path: Path, expected: str) -> bytes:
     if digest.hexdigest() != expected:
         raise ManifestError(
             f"{path}: expected sha256 {expected}, got {digest.hexdigest()}; "
-            "the file is damaged or the manifest is of another export"
+            "the file is damaged or the manifest belongs to another export"
         )
     return digest.digest()

@@ -1,4 +1,4 @@
-"""Run bounded concurrent work on a stream of items, and take the results in order."""
+"""Run a bounded number of tasks on a stream of items, and take the results in order."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ async def in_order(
     """Yield ``work(item)`` for every item, in the order of the items, ``limit`` at a time.
 
     The next item is only taken when fewer than ``limit`` results are outstanding. Closing the
-    generator cancels what is outstanding, or with ``cancel_rest=False`` waits for it: a task that
-    only waits for a thread cannot stop the thread. ``items`` is not closed; its owner does that.
-    Raises what ``items`` and ``work`` raise.
+    generator cancels the outstanding tasks, or with ``cancel_rest=False`` waits for them, since a
+    task that waits for a thread cannot stop the thread. ``items`` is not closed; its owner does
+    that. Exceptions of ``items`` and ``work`` pass through.
     """
     outstanding: deque[asyncio.Future[_Result]] = deque()
     try:

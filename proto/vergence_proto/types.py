@@ -1,6 +1,6 @@
-"""The values that cross the border between client, service and models, as numpy and dataclasses.
+"""The values that client, service and models exchange, as dataclasses of numpy arrays.
 
-They are made by the codec or by a reader, which check them; below those nothing is checked again.
+The codec and the data set readers make them and check them. Code below those does not check again.
 """
 
 import re
@@ -10,8 +10,8 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from vergence_proto.errors import BadCalibration, BadShape
-from vergence_proto.geometry import Pose, RectifiedRig
+from vergence_proto.errors import BadCalibration, BadPose, BadShape
+from vergence_proto.geometry import Pose, RectifiedRig, check_rotation
 
 Image = NDArray[np.uint8]  # [H, W, 3], RGB
 Plane = NDArray[np.float32]  # [H, W]; NaN where there is no value
@@ -23,27 +23,43 @@ _RECTIFIED_TOLERANCE = 1e-6
 
 
 class Distortion(Enum):
+    """The lens model of a camera."""
+
     NONE = "none"
-    BROWN_CONRADY = "brown-conrady"  # k1 k2 p1 p2 [k3 [k4 k5 k6]], as OpenCV orders them
-    KANNALA_BRANDT = "kannala-brandt"  # fisheye: k1 k2 k3 k4
+    """A pinhole camera without coefficients."""
+    BROWN_CONRADY = "brown-conrady"
+    """Radial and tangential: k1 k2 p1 p2 [k3 [k4 k5 k6]], in OpenCV's order."""
+    KANNALA_BRANDT = "kannala-brandt"
+    """Fisheye: k1 k2 k3 k4, in OpenCV's order."""
 
 
 @dataclass(frozen=True, slots=True)
 class Intrinsics:
     """One pinhole or fisheye camera. Lengths in pixels; pixel centres sit at integers.
 
-    Raises BadCalibration: a size or focal length that is not positive, a value that is not finite,
-    or a number of coefficients that the distortion model does not have.
+    Raises
+    ------
+    BadCalibration
+        A size or focal length is not positive, a value is not finite, or the distortion model does
+        not take this number of coefficients.
     """
 
     width: int
+    """Image width in pixels."""
     height: int
+    """Image height in pixels."""
     fx: float
+    """Horizontal focal length in pixels."""
     fy: float
+    """Vertical focal length in pixels."""
     cx: float
+    """Column of the principal point in pixels."""
     cy: float
+    """Row of the principal point in pixels."""
     distortion: Distortion = Distortion.NONE
+    """The lens model that ``coefficients`` belong to."""
     coefficients: tuple[float, ...] = ()
+    """Distortion coefficients in OpenCV's order; empty for ``Distortion.NONE``."""
 
     def __post_init__(self) -> None:
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.coefficients)
@@ -64,7 +80,7 @@ class Intrinsics:
 
     @property
     def matrix(self) -> NDArray[np.float64]:
-        """K [3, 3]."""
+        """The camera matrix K, float64 [3, 3], in pixels."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], np.float64)
 
 
@@ -79,12 +95,18 @@ _COEFFICIENT_COUNTS = {
 class StereoRig:
     """Two cameras as they are, rectified or not.
 
-    Raises BadCalibration: different image sizes, or a baseline of zero.
+    Raises
+    ------
+    BadCalibration
+        The image sizes differ, ``left_from_right`` is no rigid transform, or the baseline is zero.
     """
 
     left: Intrinsics
+    """The left camera."""
     right: Intrinsics
-    left_from_right: Pose  # OpenCV camera axes, metres
+    """The right camera; its images have the size of the left ones."""
+    left_from_right: Pose
+    """Maps right-camera to left-camera coordinates: OpenCV camera axes, metres."""
 
     def __post_init__(self) -> None:
         if (self.left.width, self.left.height) != (self.right.width, self.right.height):
@@ -92,6 +114,10 @@ class StereoRig:
                 f"both images must have one size, got left {self.left.width}x{self.left.height} "
                 f"and right {self.right.width}x{self.right.height}"
             )
+        try:
+            check_rotation(self.left_from_right.rotation)
+        except BadPose as error:
+            raise BadCalibration(f"left_from_right: {error}") from None
         baseline_m = float(np.linalg.norm(self.left_from_right.translation_m))
         if not np.isfinite(baseline_m) or baseline_m <= 0:
             raise BadCalibration(
@@ -101,12 +127,13 @@ class StereoRig:
 
     @classmethod
     def from_rectified(cls, rig: RectifiedRig) -> "StereoRig":
+        """Make the general form of a rectified rig."""
         left = Intrinsics(rig.width, rig.height, rig.fx, rig.fy, rig.cx_left, rig.cy)
         right = Intrinsics(rig.width, rig.height, rig.fx, rig.fy, rig.cx_right, rig.cy)
         return cls(left, right, Pose(np.eye(3), np.array([rig.baseline_m, 0.0, 0.0])))
 
     def as_rectified(self) -> RectifiedRig | None:
-        """The same rig as a rectified one if its rows already correspond, else None."""
+        """Return the same rig as a rectified one if its rows already correspond, else None."""
         left, right = self.left, self.right
         if left.distortion is not Distortion.NONE or right.distortion is not Distortion.NONE:
             return None
@@ -129,115 +156,168 @@ class StereoRig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseSample:
-    """Where the left camera was at mid-exposure, and how far that can be trusted.
+    """The pose of the left camera at mid-exposure, with its tracking flags.
 
-    The flags are those of OpenXR's XrSpaceLocationFlags: valid means usable, tracked means
-    measured and not predicted.
+    The flags are those of OpenXR's XrSpaceLocationFlags.
     """
 
-    world_from_left: Pose  # in the stream's axes until the engine converts it
+    world_from_left: Pose
+    """Maps left-camera to world coordinates, in the axes of the session, metres."""
     orientation_valid: bool = True
+    """The orientation can be used."""
     position_valid: bool = True
+    """The position can be used."""
     tracked: bool = True
+    """The pose was measured, and not predicted or inferred."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StereoFrame:
-    """One pair, decoded."""
+    """One decoded stereo pair."""
 
-    frame_id: int  # from 1, strictly increasing within a stream
-    capture_ns: int  # client's monotonic clock, mid-exposure
+    frame_id: int
+    """The id of the frame, from 1, strictly increasing within a stream."""
+    capture_ns: int
+    """Time of mid-exposure in nanoseconds, on the client's monotonic clock."""
     left: Image
-    right: Image  # same shape as left
+    """The left image, uint8 [H, W, 3], RGB."""
+    right: Image
+    """The right image; it has the shape of the left one."""
     pose: PoseSample | None = None
+    """The pose of the left camera; None if it is not known."""
 
 
 class ImageEncoding(Enum):
-    """How an image travels."""
+    """The format in which images travel to the server."""
 
-    RAW = "raw"  # mono8 or rgb8, by the number of channels
+    RAW = "raw"
+    """Uncompressed and exact: mono8 or rgb8, by the number of channels."""
     JPEG = "jpeg"
+    """Small and lossy; the session's ``jpeg_quality`` applies."""
     PNG = "png"
+    """Compressed and exact; encoding takes time."""
 
 
 class PlaneEncoding(Enum):
-    """How a disparity map travels."""
+    """The number format in which disparity travels to the client."""
 
-    UINT16 = "uint16"  # fixed point, 0 = no value
+    UINT16 = "uint16"
+    """Fixed point, see :attr:`OutputFormat.denominator`; 0 means no value."""
     FLOAT16 = "float16"
+    """IEEE half precision."""
     FLOAT32 = "float32"
+    """IEEE single precision: the bits that the model returned."""
 
 
 class Delivery(Enum):
-    NEWEST = "newest"  # live: a newer frame displaces one that waits
-    EVERY = "every"  # lossless: every frame is stepped, in order, and the sender waits
+    """What the server does with a frame while an older one of the stream is still waiting."""
+
+    NEWEST = "newest"
+    """Live: the newer frame displaces the one that waits."""
+    EVERY = "every"
+    """Lossless: every frame is stepped, in order, and the sender waits."""
 
 
 @dataclass(frozen=True, slots=True)
 class OutputFormat:
-    """What a client wants back. The default is exact to 1/64 px and the smallest."""
+    """The content and precision of results. The default is the smallest, exact to 1/64 px."""
 
     encoding: PlaneEncoding = PlaneEncoding.UINT16
-    denominator: int = 64  # of UINT16, 16 to 64: stored = round(value * denominator)
-    compressed: bool = True  # UINT16 only; lossless
+    """The number format of the disparity map."""
+    denominator: int = 64
+    """UINT16 only, 16 to 64: the stored number is ``round(disparity_px * denominator)``."""
+    compressed: bool = True
+    """UINT16 only: compress the map without loss."""
     confidence: bool = False
+    """Request :attr:`DisparityMap.confidence`."""
     sigma: bool = False
+    """Request :attr:`DisparityMap.sigma_px`."""
 
 
 class Origin(Enum):
-    """Why the state a step ran on was what it was; the names are those of the wire."""
+    """The reason why a step ran on the state that it ran on; names are those of the wire."""
 
     WARM = "warm"
+    """The step continued from the previous frame."""
     COLD_START = "cold start"
+    """The first frame of a stream: there was no state."""
     RESUMED = "resumed"
+    """The first frame after a reconnection; the state was kept."""
     RESET_REQUESTED = "reset requested"
+    """The client asked for a reset."""
     RESET_POSE_LOST = "pose lost"
+    """This frame or the previous one has no usable pose."""
     RESET_POSE_JUMP = "pose jump"
+    """The camera moved too far between two frames."""
     RESET_GAP = "gap"
+    """Too much time passed between two frames."""
     RESET_TIME_BACKWARDS = "time went backwards"
+    """The capture time is before that of the previous frame."""
     RESET_NON_FINITE = "result was not finite"
+    """The previous result contained numbers that are not finite."""
 
 
 @dataclass(frozen=True, slots=True)
 class Timings:
-    """Where the server's time went, in seconds."""
+    """The server's time for one frame, by stage, in seconds."""
 
     decode_s: float = 0.0
+    """Time to decode the images."""
     queue_s: float = 0.0
+    """Time that the frame waited for its turn."""
     model_s: float = 0.0
+    """Time of the network."""
     encode_s: float = 0.0
-    total_s: float = 0.0  # from the frame's arrival to the hand-over of its answer
+    """Time to encode the result."""
+    total_s: float = 0.0
+    """Time from the frame's arrival to the hand-over of its result to the transport."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DisparityMap:
-    """The answer to one frame, in the rectified left image."""
+    """The result of one frame, in the pixels of the rectified left image."""
 
     frame_id: int
+    """The id of the frame, as :meth:`vergence.DepthSession.submit` returned it."""
     capture_ns: int
+    """The frame's capture time in nanoseconds, as it was sent."""
     rig: RectifiedRig
-    disparity_px: Plane  # positive; Z = fx * baseline / d; NaN where there is no value
-    sigma_px: Plane | None = None  # expected absolute error
-    confidence: NDArray[np.uint8] | None = None  # probability of an error below 1 px, times 255
-    world_from_left: Pose | None = None  # the rectified camera's, as the warp used it
+    """The rectified rig that disparity, depth and pixels refer to."""
+    disparity_px: Plane
+    """Float32 [H, W], pixels, positive: ``Z = fx * baseline_m / disparity_px``; NaN: no value."""
+    sigma_px: Plane | None = None
+    """Float32 [H, W], pixels: expected absolute error of the disparity; None if not requested."""
+    confidence: NDArray[np.uint8] | None = None
+    """Uint8 [H, W]: probability of an error below 1 px, times 255; None if not requested."""
+    world_from_left: Pose | None = None
+    """The pose of the rectified left camera that the step used; None if the frame had none."""
     origin: Origin = Origin.WARM
-    step_count: int = 1  # steps since the state was new, this one included
+    """The reason why the step ran on its state; anything but WARM and RESUMED was a new start."""
+    step_count: int = 1
+    """Steps since the state was new, this one included."""
     iterations: int = 1
-    frames_skipped: int = 0  # sent but not stepped since the last map
+    """Refinement iterations of this step."""
+    frames_skipped: int = 0
+    """Frames that were sent and not stepped since the previous result."""
     timings: Timings = field(default_factory=Timings)
+    """The server's time for this frame."""
 
     @property
     def depth_m(self) -> Plane:
-        """Metres along the optical axis; NaN where there is no value."""
+        """Depth in metres along the optical axis, float32 [H, W]; NaN where there is no value."""
         return self.rig.depth_from_disparity(self.disparity_px)
 
     @property
     def offset_px(self) -> Plane:
-        """u_left - u_right as the images show it: what stereo data sets call disparity."""
+        """``u_left - u_right`` in pixels, float32 [H, W]: what stereo data sets call disparity.
+
+        It differs from ``disparity_px`` where the principal points differ.
+        """
         return self.disparity_px + np.float32(self.rig.offset_of_zero_disparity_px)
 
     @property
     def valid(self) -> NDArray[np.bool_]:
+        """Bool [H, W]: true where the disparity has a value."""
         return np.isfinite(self.disparity_px)
 
 

@@ -1,5 +1,5 @@
-"""The server: keeps one recurrent state per stream and answers frames with disparity.
+"""The server: it keeps one recurrent state per stream and answers frames with disparity.
 
-Read in this order: ``transports.stream_call``, ``streams.engine``, ``streams.stream``,
-``inference.batcher``, ``inference.model``.
+Read the packages from the bottom up: ``inference`` (the model), ``streams`` (states and the
+engine), ``jobs`` (uploaded sequences), ``transports`` (gRPC, HTTP, Zenoh), ``app`` (composition).
 """

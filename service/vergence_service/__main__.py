@@ -1,4 +1,4 @@
-"""``vergence serve``, and the same as ``python -m vergence_service``."""
+"""The command ``vergence serve``, also ``python -m vergence_service``."""
 
 import asyncio
 import logging
@@ -16,7 +16,7 @@ from vergence_service.malloc import keep_freed_memory
 from vergence_service.settings import SettingsError, load_settings
 from vergence_service.transports.errors import ExtraMissing, PortTaken, ZenohUnreachable
 
-# What an operator can mend: told in one line, without a trace.
+# Errors that an operator can fix. They are reported in one line, without a traceback.
 _OPERATOR_ERRORS = (
     SettingsError,
     ManifestError,
@@ -31,30 +31,34 @@ _OPERATOR_ERRORS = (
 def serve(
     config: Annotated[Path | None, typer.Option(help="Settings as a TOML file.")] = None,
     print_config: Annotated[
-        bool, typer.Option("--print-config", help="Print the settings as TOML, and end.")
+        bool, typer.Option("--print-config", help="Print the settings as TOML and exit.")
     ] = False,
-    grpc_port: Annotated[int | None, typer.Option(help="0: a free one.")] = None,
-    http_port: Annotated[int | None, typer.Option(help="0: a free one.")] = None,
-    host: Annotated[str | None, typer.Option(help="To listen on, for all.")] = None,
+    grpc_port: Annotated[int | None, typer.Option(help="Port of gRPC; 0 picks a free one.")] = None,
+    http_port: Annotated[int | None, typer.Option(help="Port of HTTP; 0 picks a free one.")] = None,
+    host: Annotated[
+        str | None, typer.Option(help="Address that every transport listens on.")
+    ] = None,
     zenoh: Annotated[
         bool | None, typer.Option("--zenoh/--no-zenoh", help="Serve over Zenoh too.")
     ] = None,
-    model: Annotated[str | None, typer.Option(help="A model of the manifest.")] = None,
-    weights: Annotated[Path | None, typer.Option(help="A folder with a manifest.")] = None,
-    threads: Annotated[int | None, typer.Option(help="Of one step; 0: one a core.")] = None,
+    model: Annotated[str | None, typer.Option(help="Model of the manifest.")] = None,
+    weights: Annotated[Path | None, typer.Option(help="Folder with a manifest.")] = None,
+    threads: Annotated[
+        int | None, typer.Option(help="Threads of all steps; 0 uses one per core.")
+    ] = None,
 ) -> None:
-    """Serve depth over gRPC, and over Zenoh if asked; health and metrics over HTTP.
+    """Serve depth over gRPC, HTTP and, with --zenoh, Zenoh.
 
-    Every setting is also a variable (VERGENCE_GRPC__PORT) and a key of the file; --print-config
-    lists them. Flags win over variables, those over the file. Once it serves, one line on
-    standard output tells the addresses: "listening grpc=HOST:PORT http=HOST:PORT", and
-    with Zenoh " zenoh=ENDPOINT".
+    Every setting is also an environment variable (VERGENCE_GRPC__PORT) and a key of the file;
+    --print-config lists them. Flags win over variables, and variables over the file. When the
+    server is ready, it prints one line: "listening grpc=HOST:PORT http=HOST:PORT", and with Zenoh
+    also " zenoh=ENDPOINT".
     """
     flags: dict[str, Any] = {
         "grpc.port": grpc_port,
         "http.port": http_port,
-        "grpc.host": host,
-        "http.host": host,
+        # A flag wins over the file, whichever of these the file sets.
+        **dict.fromkeys(("server.host", "grpc.host", "http.host", "zenoh.host"), host),
         "zenoh.enabled": zenoh,
         "model.name": model,
         "model.weights": weights,

@@ -1,4 +1,4 @@
-"""How the process holds on to memory."""
+"""Tune the memory allocator of the process."""
 
 import ctypes
 
@@ -8,10 +8,10 @@ _LARGEST_FRAME_BYTES = 1 << 28
 
 
 def keep_freed_memory() -> bool:
-    """Let malloc keep what is freed, where the C library is glibc; tells whether it is.
+    """Let malloc keep freed memory. Returns False if the C library is not glibc.
 
-    A frame takes and frees megabytes in a dozen pieces. By default each piece goes back to the
-    kernel and is faulted in again, page by page, for the next frame: about a millisecond of it.
+    A frame allocates and frees megabytes in a dozen pieces. By default, each piece returns to the
+    kernel and is faulted in again, page by page, for the next frame. That takes about 1 ms.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is None:

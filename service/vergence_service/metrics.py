@@ -1,4 +1,4 @@
-"""What the server counts, for Prometheus."""
+"""The metrics of the server, for Prometheus."""
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 
@@ -7,58 +7,68 @@ _SEQUENCE_BUCKETS_S = (0.1, 0.5, 1, 5, 10, 30, 60, 300, 600, 1800, 3600, 7200)
 
 
 class Metrics:
-    """All counters of one server, in the registry given."""
+    """All metrics of one server, in ``registry``."""
 
     def __init__(self, registry: CollectorRegistry) -> None:
         self.frames_stepped = Counter(
-            "vergence_frames_stepped", "Frames answered with a map", ["origin"], registry=registry
+            "vergence_frames_stepped",
+            "Frames answered with a disparity map",
+            ["origin"],
+            registry=registry,
         )
         self.frames_dropped = Counter(
-            "vergence_frames_dropped", "Frames displaced by a newer one", registry=registry
+            "vergence_frames_dropped",
+            "Frames that were displaced by a newer frame",
+            registry=registry,
         )
         self.frames_failed = Counter(
-            "vergence_frames_failed", "Frames answered with an error", ["reason"], registry=registry
+            "vergence_frames_failed",
+            "Frames that were answered with an error",
+            ["reason"],
+            registry=registry,
         )
         self.stage_s = Histogram(
             "vergence_stage_seconds",
-            "Time of one frame in one stage",
+            "Time that one frame spent in one stage",
             ["stage"],
             buckets=_STAGE_BUCKETS_S,
             registry=registry,
         )
         self.batch_size = Histogram(
             "vergence_batch_size",
-            "Streams stepped together",
+            "Frames that the model stepped together",
             buckets=(1, 2, 4, 8, 16, 32),
             registry=registry,
         )
-        self.streams_open = Gauge(
-            "vergence_streams_open", "Streams with a state", registry=registry
-        )
+        self.streams_open = Gauge("vergence_streams_open", "Open streams", registry=registry)
         self.state_bytes = Gauge(
-            "vergence_state_bytes", "Memory reserved for states", registry=registry
+            "vergence_state_bytes", "Memory reserved for recurrent states", registry=registry
         )
         self.sequences = Gauge(
             "vergence_sequences",
-            "Accepted sequences that have not ended",
+            "Accepted sequences that wait or run",
             ["state"],
             registry=registry,
         )
         self.sequences_done = Counter(
-            "vergence_sequences_done", "Sequences that were done", registry=registry
+            "vergence_sequences_done", "Sequences that succeeded", registry=registry
         )
         self.sequences_failed = Counter(
             "vergence_sequences_failed", "Sequences that failed", ["reason"], registry=registry
         )
         self.sequence_frames = Counter(
-            "vergence_sequence_frames", "Frames of sequences, results on disk", registry=registry
+            "vergence_sequence_frames",
+            "Frames of sequences whose result was written",
+            registry=registry,
         )
         self.sequence_s = Histogram(
             "vergence_sequence_seconds",
-            "Time of one run of a sequence, from its start to its end",
+            "Time of one run of a sequence",
             buckets=_SEQUENCE_BUCKETS_S,
             registry=registry,
         )
         self.sequence_disk_bytes = Gauge(
-            "vergence_sequence_disk_bytes", "Disk that sequences take or may", registry=registry
+            "vergence_sequence_disk_bytes",
+            "Disk space that sequences use or have reserved",
+            registry=registry,
         )

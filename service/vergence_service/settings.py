@@ -1,4 +1,4 @@
-"""What an operator may set, and where it comes from: flags, then the environment, then a file."""
+"""The server's settings, read from flags, environment variables and a file, in this order."""
 
 import difflib
 import json
@@ -17,107 +17,168 @@ _NESTED = "__"
 
 
 class SettingsError(ValueError):
-    """A setting is unknown, or its value is not one."""
+    """A setting is unknown, or its value is not allowed."""
 
 
 class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class GrpcSettings(_Section):
-    host: str = "127.0.0.1"
-    port: int = Field(default=50051, ge=0, le=65535, description="0: a free one")
-    credit: PositiveInt = Field(default=2, description="frames that a client may have unanswered")
-    waiting_frames: PositiveInt = Field(
-        default=8, description="of a lossless stream, before it waits"
-    )
-    max_frame_mib: PositiveInt = 32
+class ServerSettings(_Section):
+    host: str = Field(default="127.0.0.1", description="address that every transport listens on")
     drain_s: PositiveFloat = Field(
-        default=5.0, description="for clients to leave before they are ended"
+        default=5.0, description="time that clients have to leave when the server shuts down"
     )
+
+
+class GrpcSettings(_Section):
+    host: str | None = Field(default=None, description="gRPC's own address; default: server.host")
+    port: int = Field(default=50051, ge=0, le=65535, description="TCP port; 0 picks a free one")
 
 
 class HttpSettings(_Section):
-    host: str = "127.0.0.1"
-    port: int = Field(default=8000, ge=0, le=65535, description="0: a free one")
-
-
-class BatchSettings(_Section):
-    directory: Path | None = Field(
-        default=None, description="of jobs and results; $XDG_STATE_HOME/vergence/batch"
-    )
-    waiting: PositiveInt = Field(default=64, description="sequences, the running one included")
-    waiting_per_client: PositiveInt | None = Field(default=None, description="those of one address")
-    checkpoint_s: PositiveFloat = Field(default=2.0, description="of work that a crash may cost")
-    keep_h: PositiveFloat = Field(default=24.0, description="results, unless space runs short")
-    disk_mib: PositiveInt = Field(default=20_480, description="of all jobs together")
-    max_upload_mib: PositiveInt = 4096
-    max_unpacked_mib: PositiveInt = 8192
-    max_files: PositiveInt = Field(default=100_000, description="in one upload")
-    max_ratio: PositiveFloat = Field(default=100.0, description="of unpacked to uploaded size")
-    idle_s: PositiveFloat = Field(default=30.0, description="before a silent upload is given up")
+    host: str | None = Field(default=None, description="HTTP's own address; default: server.host")
+    port: int = Field(default=8000, ge=0, le=65535, description="TCP port; 0 picks a free one")
 
 
 class ZenohSettings(_Section):
-    enabled: bool = False
+    enabled: bool = Field(default=False, description="serve over Zenoh too")
+    host: str | None = Field(
+        default=None, description="address of the default listen endpoint; default: server.host"
+    )
     namespace: str = Field(
         default="vergence",
         pattern=r"^[\w.-]+(/[\w.-]+)*$",
-        description="the first chunks of every key",
+        description="prefix of every key",
     )
     mode: Literal["router", "peer", "client"] = Field(
-        default="router", description="client or peer: joins the routers of connect"
+        default="router",
+        description="router listens; peer and client connect to the routers in connect",
     )
     listen: tuple[str, ...] = Field(
-        default=(), description="endpoints; a router without one: port 7447 on the host of gRPC"
+        default=(),
+        description="endpoints to listen on; a router without any uses port 7447 of zenoh.host",
     )
-    connect: tuple[str, ...] = Field(default=(), description="endpoints of routers and peers")
+    connect: tuple[str, ...] = Field(
+        default=(), description="endpoints of routers and peers to connect to"
+    )
     config: Path | None = Field(
         default=None,
-        description="a Zenoh JSON5 file, for TLS and access control; instead of mode and endpoints",
+        description="Zenoh JSON5 file for TLS and access control; replaces mode and endpoints",
     )
 
 
 class ModelSettings(_Section):
-    name: str = "lite"
+    name: str = Field(default="lite", description="model of the manifest")
     weights: Path | None = Field(
-        default=None, description="a folder with a manifest; the packaged one"
+        default=None, description="folder with a manifest.json; default: the installed weights"
     )
     providers: tuple[Literal["cpu", "cuda", "tensorrt", "openvino"], ...] = Field(
-        default=("cpu",), min_length=1, description="in order of preference"
+        default=("cpu",), min_length=1, description="execution providers in order of preference"
     )
-    threads: int = Field(default=0, ge=0, description="of all steps; 0: one a core")
-    allow_spinning: bool = Field(default=False, description="quicker steps, for all of a core")
-    iterations: PositiveInt = Field(default=1, description="of a warm step")
-    cold_iterations: PositiveInt = Field(default=5, description="of a live cold start, at most")
+    threads: int = Field(
+        default=0, ge=0, description="threads that all steps share; 0 uses one per core"
+    )
+    allow_spinning: bool = Field(
+        default=False, description="make steps faster by keeping idle threads busy"
+    )
+    iterations: PositiveInt = Field(default=1, description="iterations of a warm step")
+    cold_iterations: PositiveInt = Field(
+        default=5, description="most iterations of a live stream's cold step"
+    )
     cold_iterations_every: PositiveInt = Field(
-        default=8, description="the same of a stream that wants every frame: no frame is in a hurry"
+        default=8, description="most iterations of the cold step of a lossless stream or a pair"
     )
     max_batch: PositiveInt = Field(
-        default=1, description="streams stepped together on a GPU; a CPU steps each by itself"
+        default=1, description="streams that a GPU steps together; a CPU steps each by itself"
     )
 
 
 class StreamSettings(_Section):
-    capacity: PositiveInt = 16
-    per_client: PositiveInt | None = Field(
-        default=None, description="streams of one address, over gRPC and HTTP"
+    capacity: PositiveInt = Field(default=16, description="most streams that are open at once")
+    credit: PositiveInt = Field(
+        default=2, description="most frames that a client may send before an answer returns"
     )
-    max_state_mib: PositiveInt = 512
-    max_pixels: PositiveInt = Field(default=4_000_000, description="of one image")
-    idle_timeout_s: PositiveFloat = 60.0
-    idle_notice_s: PositiveFloat = Field(default=10.0, description="before the timeout")
+    waiting_frames: PositiveInt = Field(
+        default=8, description="frames of a lossless stream that wait before its sender must wait"
+    )
+    idle_timeout_s: PositiveFloat = Field(
+        default=60.0, description="close a connected stream that sends no frame for this long"
+    )
+    idle_notice_s: PositiveFloat = Field(
+        default=10.0, description="warn the client this long before idle_timeout_s ends"
+    )
     detach_grace_s: PositiveFloat = Field(
-        default=10.0, description="for a lost client to come back"
+        default=10.0, description="keep a stream this long after its connection is lost"
+    )
+
+
+class LimitSettings(_Section):
+    max_pixels: PositiveInt = Field(default=4_000_000, description="largest image, in pixels")
+    max_frame_mib: PositiveInt = Field(
+        default=32, description="largest message with one frame or one answer"
+    )
+    max_state_mib: PositiveInt = Field(
+        default=512, description="memory for the recurrent states of all streams together"
+    )
+    streams_per_client: PositiveInt | None = Field(
+        default=None, description="most open streams of one address, over gRPC and HTTP"
     )
 
 
 class ContinuitySettings(_Section):
     max_gap_s: PositiveFloat = Field(
-        default=15.0, description="above the grace, so a resume is warm"
+        default=15.0,
+        description="longest time between two frames; above detach_grace_s, so a resume is warm",
     )
-    max_jump_m: PositiveFloat = Field(default=3.0, description="a car between two frames at 10 Hz")
-    max_jump_deg: PositiveFloat = Field(default=45.0, description="past it little is seen by both")
+    max_jump_m: PositiveFloat = Field(
+        default=3.0, description="longest motion between two frames; a car at 10 Hz stays below"
+    )
+    max_jump_deg: PositiveFloat = Field(
+        default=45.0,
+        description="largest rotation between two frames; beyond it the views hardly overlap",
+    )
+
+
+class BatchSettings(_Section):
+    directory: Path | None = Field(
+        default=None,
+        description="folder of jobs and results; default: $XDG_STATE_HOME/vergence/batch",
+    )
+    waiting: PositiveInt = Field(
+        default=64, description="most unfinished sequences, the running one included"
+    )
+    waiting_per_client: PositiveInt | None = Field(
+        default=None, description="most unfinished sequences of one address"
+    )
+    checkpoint_s: PositiveFloat = Field(
+        default=2.0, description="seconds of work that a crash may cost"
+    )
+    keep_h: PositiveFloat = Field(
+        default=24.0, description="hours that results are kept; less if disk_mib runs short"
+    )
+    disk_mib: PositiveInt = Field(default=20_480, description="disk space of all jobs together")
+    max_upload_mib: PositiveInt = Field(default=4096, description="largest upload")
+    max_unpacked_mib: PositiveInt = Field(default=8192, description="largest unpacked archive")
+    max_files: PositiveInt = Field(default=100_000, description="most files in one upload")
+    max_ratio: PositiveFloat = Field(
+        default=100.0, description="largest ratio of unpacked size to uploaded size"
+    )
+    idle_s: PositiveFloat = Field(
+        default=30.0, description="abort an upload that sends nothing for this long"
+    )
+
+
+# Keys that had another name in earlier versions.
+_MOVED: Mapping[str, str] = {
+    "grpc.credit": "streams.credit",
+    "grpc.waiting_frames": "streams.waiting_frames",
+    "grpc.max_frame_mib": "limits.max_frame_mib",
+    "grpc.drain_s": "server.drain_s",
+    "streams.per_client": "limits.streams_per_client",
+    "streams.max_state_mib": "limits.max_state_mib",
+    "streams.max_pixels": "limits.max_pixels",
+}
 
 
 class Settings(BaseSettings):
@@ -130,17 +191,21 @@ class Settings(BaseSettings):
         env_nested_delimiter=_NESTED,
     )
 
+    log_level: Literal["debug", "info", "warning", "error"] = Field(
+        default="info", description="least severe messages to log"
+    )
+    server: ServerSettings = ServerSettings()
     grpc: GrpcSettings = GrpcSettings()
     http: HttpSettings = HttpSettings()
     zenoh: ZenohSettings = ZenohSettings()
-    batch: BatchSettings = BatchSettings()
     model: ModelSettings = ModelSettings()
     streams: StreamSettings = StreamSettings()
+    limits: LimitSettings = LimitSettings()
     continuity: ContinuitySettings = ContinuitySettings()
-    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    batch: BatchSettings = BatchSettings()
 
     def to_toml(self) -> str:
-        """As a file that says the same, with what each key means."""
+        """The settings as a file, with the meaning of each key."""
         sections = {name: value for name, value in self if isinstance(value, _Section)}
         lines = [f"log_level = {json.dumps(self.log_level)}"]
         for name, section in sections.items():
@@ -151,10 +216,12 @@ class Settings(BaseSettings):
 def load_settings(
     *, config: Path | None = None, flags: Mapping[str, Any] | None = None
 ) -> Settings:
-    """Flags win over ``VERGENCE_*`` variables, and those over the file.
+    """Read the settings: flags win over ``VERGENCE_*`` variables, and variables over the file.
 
-    Keys are dotted in ``flags`` ("grpc.port"), nested with ``__`` in the environment
-    (``VERGENCE_GRPC__PORT``), sections in the file. Raises SettingsError.
+    A key is written "grpc.port" in ``flags``, ``VERGENCE_GRPC__PORT`` in the environment, and
+    ``port`` in the section ``[grpc]`` of the file.
+
+    Raises SettingsError if a key is unknown, a value is not allowed or the file cannot be read.
     """
     from_file = _read(config) if config else {}
     _check_known(_dotted(from_file), f"in {config}")
@@ -202,6 +269,8 @@ def _check_known(keys: Iterable[str], where: str) -> None:
     known = list(_dotted(Settings.model_construct().model_dump()))
     for key in keys:
         if key not in known:
+            if key in _MOVED:
+                raise SettingsError(f"setting {key!r} {where} is now called {_MOVED[key]!r}")
             nearest = difflib.get_close_matches(key, known, n=1, cutoff=0.0)
             raise SettingsError(f"unknown setting {key!r} {where}; the nearest is {nearest[0]!r}")
 

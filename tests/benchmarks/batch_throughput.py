@@ -38,7 +38,7 @@ from vergence_proto.datasets import SourceFrame, StereoSource, open_source
 from vergence_proto.geometry import RectifiedRig
 from vergence_proto.instruction_set import instruction_set
 from vergence_proto.types import StereoRig
-from vergence_service.inference.model import RecurrentState, Step, View
+from vergence_service.inference.model import RecurrentState, Step, StereoView
 from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
 from vergence_service.jobs.sources import without_truth
 
@@ -65,7 +65,7 @@ class BareLoop:
             frame = source.frame
             assert frame.pose is not None
             pose = frame.pose.world_from_left
-            view = View(frame.left, frame.right, self._rig, frame.capture_ns, pose)
+            view = StereoView(frame.left, frame.right, self._rig, frame.capture_ns, pose)
             [result] = self._model.step([Step(view, state, self._iterations(state))])
             state = result.state
         return len(frames) / (time.perf_counter() - started_s)

@@ -21,12 +21,12 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from vergence_models.config import Kind, RaftNetworkConfig, load_config
+from vergence_models.config import RaftNetworkConfig, StepKind, load_config
 from vergence_models.export import exported_parts
 from vergence_models.networks.raft.network import RaftNetwork
 from vergence_models.onnx_export.stitch import (
     TAKES_PLACE,
-    Parts,
+    StepParts,
     stitched,
     write_with_shared_weights,
 )
@@ -45,7 +45,7 @@ def session_of(graph: Path | bytes, threads: int) -> onnxruntime.InferenceSessio
     return onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
 
 
-def in_turn(sessions: Parts[onnxruntime.InferenceSession], feed: Feed, count: int) -> None:
+def in_turn(sessions: StepParts[onnxruntime.InferenceSession], feed: Feed, count: int) -> None:
     """A step by its parts: what one hands over is an input of those that follow."""
     tensors = dict(feed)
     for session in (*sessions.begin, *([sessions.iterate] * count), sessions.end):
@@ -81,7 +81,7 @@ def main() -> None:
     with TemporaryDirectory() as folder:
         out = Path(folder)
         paths = {count: out / f"step_{count}.onnx" for count in COUNTS}
-        models = {path: stitched(parts, Kind(count)) for count, path in paths.items()}
+        models = {path: stitched(parts, StepKind(count)) for count, path in paths.items()}
         whole = sum(model.ByteSize() for model in models.values())
         write_with_shared_weights(models, out / "weights")
         shared = sum(path.stat().st_size for path in (*paths.values(), out / "weights"))
@@ -89,7 +89,7 @@ def main() -> None:
             session_of(part.SerializeToString(), given.threads)
             for part in (*parts.begin, parts.iterate, parts.end)
         )
-        sessions = Parts((begin,), *rest)
+        sessions = StepParts((begin,), *rest)
         fused = {count: session_of(paths[count], given.threads) for count in MEASURED}
         images = np.random.default_rng(0).integers(0, 256, (2, 1, HEIGHT, WIDTH, 3), np.uint8)
         feed: Feed = {

@@ -78,8 +78,10 @@ async def stream(address: str, *, rate_hz: float, starts_s: float, counted_s: fl
     async with DepthClient(f"grpc://{address}") as client, client.open_session(RIG) as session:
         camera = asyncio.create_task(film(session))
         async for result in session:
-            if starts_s <= time.monotonic() < starts_s + counted_s:
-                ages_s.append((time.monotonic_ns() - result.capture_ns) * 1e-9)
+            now_s = time.monotonic()
+            if starts_s <= now_s < starts_s + counted_s:
+                age_s = (time.monotonic_ns() - result.capture_ns) * 1e-9
+                ages_s.append(age_s)
         await camera
     return ages_s
 

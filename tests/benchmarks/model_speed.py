@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from vergence_models.evaluation.sgbm import sgbm_disparity
 from vergence_proto.geometry import Pose, RectifiedRig
 from vergence_proto.instruction_set import instruction_set
-from vergence_service.inference.model import Step, View
+from vergence_service.inference.model import Step, StereoView
 from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
 from vergence_service.settings import ModelSettings
 
@@ -84,7 +84,7 @@ def main() -> None:
         threads=given.threads,
         allow_spinning=settings.allow_spinning,
     )
-    view = View(left, right, RIG, capture_ns=0, world_from_left=Pose.identity())
+    view = StereoView(left, right, RIG, capture_ns=0, world_from_left=Pose.identity())
     (cold,) = model.step([Step(view, None, max(model.card.graphs))])
     warm = [Step(view, cold.state, 1)]
     found = measure(

@@ -32,7 +32,7 @@ from vergence_proto import codec
 from vergence_proto.geometry import Pose, RectifiedRig
 from vergence_proto.instruction_set import instruction_set
 from vergence_proto.types import Image, OutputFormat, PoseSample, StereoFrame
-from vergence_service.inference.model import RecurrentState, Step, View
+from vergence_service.inference.model import RecurrentState, Step, StereoView
 from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
 
 RIG = RectifiedRig(640, 480, 500.0, 500.0, 319.5, 319.5, 239.5, 0.1)
@@ -123,7 +123,7 @@ class BareModel:
         self._state: RecurrentState | None = None
 
     def step_s(self, left: Image, right: Image, world_from_left: Pose, capture_ns: int) -> float:
-        view = View(left, right, RIG, capture_ns, world_from_left)
+        view = StereoView(left, right, RIG, capture_ns, world_from_left)
         started_s = time.perf_counter()
         [result] = self._model.step([Step(view, self._state, self._iterations)])
         self._state = result.state

@@ -39,7 +39,7 @@ from vergence_proto.instruction_set import instruction_set
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.zenoh.inbox import Inbox
 from vergence_proto.zenoh.keys import StreamKeys, encoding_of
-from vergence_proto.zenoh.session import ZenohPeer, make_config
+from vergence_proto.zenoh.session import ZenohSession, make_config
 
 KEYS = StreamKeys("vergence", "benchmark")
 ATTACHMENT_ID = "benchmark"
@@ -115,9 +115,9 @@ def consume_from_channel(
 
 async def consume_from_inbox(endpoint: str, work_s: float, until_s: float) -> Ages:
     ages: Ages = []
-    peer = ZenohPeer(config("client", endpoint))
+    peer = ZenohSession(config("client", endpoint))
     await peer.open()
-    inbox = Inbox(ATTACHMENT_ID, bulky=pb.DisparityMap, room=1, displaces=True)
+    inbox = Inbox(ATTACHMENT_ID, bulky=pb.DisparityMap, max_bulky=1, drop_oldest=True)
     subscription = await peer.subscribe(KEYS.disparity, inbox.put)
     try:
         async with asyncio.timeout(until_s - time.monotonic()):

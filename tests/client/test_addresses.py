@@ -1,4 +1,4 @@
-"""What the address of a server says."""
+"""Server addresses, as they are written."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Which frames are sent, displaced or dropped, in which order, and that every one is counted."""
+"""Live and lossless frames: the order, displacement and drops, with every frame counted."""
 
 import asyncio
 

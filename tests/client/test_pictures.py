@@ -1,4 +1,4 @@
-"""What the pictures show: colours by value, scales that fit, frames that can be read back."""
+"""Pictures of disparity: colours by value, scales that fit, files that can be read back."""
 
 from pathlib import Path
 

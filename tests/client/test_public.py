@@ -1,4 +1,4 @@
-"""What `import vergence` gives, and what it costs."""
+"""The public names of `import vergence`, and its cost."""
 
 import subprocess
 import sys

@@ -31,7 +31,7 @@ from vergence import (
 
 
 class Scene:
-    """A session whose connection runs through a proxy, and what it told meanwhile."""
+    """A session whose connection runs through a proxy, and the events that it reported."""
 
     def __init__(self, model: RecallModel, proxy: Proxy, client: DepthClient) -> None:
         self.model = model
@@ -196,8 +196,8 @@ async def test_a_stream_does_not_go_on_with_other_weights() -> None:
         proxy.lead_to(second.grpc_address)
         with pytest.raises(ModelChanged, match="expected a server with weights 0000"):
             await step(session, 2)
-        async with client.open_session(RIG) as anew:
-            assert (await step(anew, 1)).step_count == 1
+        async with client.open_session(RIG) as fresh:
+            assert (await step(fresh, 1)).step_count == 1
 
 
 async def test_a_session_may_ask_for_the_weights_that_its_results_come_from() -> None:

@@ -16,7 +16,7 @@ from tests.support.sequences import make_frames, sequence_files, write_sequence,
 from tests.support.server import running_server
 from tests.support.textured_wall import write_wall
 from vergence.cli.batch import batch
-from vergence.cli.errors import Trouble
+from vergence.cli.errors import CliError
 
 
 async def run(paths: list[Path], server: str, out: Path, **query: Any) -> dict[str, Any]:
@@ -61,7 +61,7 @@ async def test_what_was_collected_takes_no_room_on_the_server(tmp_path: Path) ->
         assert (await client.get("/v1/sequences")).json() == []
 
 
-async def test_one_failure_does_not_stop_the_others_and_is_told(tmp_path: Path) -> None:
+async def test_one_failure_does_not_stop_the_others_and_is_reported(tmp_path: Path) -> None:
     dark = make_frames(3)
     dark[1].left[0, 0] = NOT_FINITE
     write_sequence(tmp_path / "dark", dark)
@@ -69,7 +69,7 @@ async def test_one_failure_does_not_stop_the_others_and_is_told(tmp_path: Path) 
     (tmp_path / "broken.zip").write_bytes(b"PK\3\4 and no more")
     paths = [tmp_path / name for name in ("dark", "broken.zip", "fine")]
     async with running_server(RecallModel()) as server:
-        with pytest.raises(Trouble, match="2 of 3 sequences failed"):
+        with pytest.raises(CliError, match="2 of 3 sequences failed"):
             await run(paths, server.http_address, tmp_path / "out")
     figures = json.loads((tmp_path / "out" / "batch.json").read_text())
     errors = {name: each["error"] for name, each in figures["results"].items()}
@@ -84,7 +84,7 @@ async def test_what_holds_no_sequence_is_told_before_anything_is_sent(
 ) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "text.txt").write_text("hello")
-    with pytest.raises(Trouble, match=name):
+    with pytest.raises(CliError, match=name):
         await run([tmp_path / name], "127.0.0.1:1", tmp_path / "out")
 
 

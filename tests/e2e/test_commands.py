@@ -125,7 +125,7 @@ def test_run_at_a_rate_accounts_for_every_frame(wall: Path, server: str, tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "told"),
+    ("arguments", "code", "expected"),
     [
         (["run", "nonsense"], 2, "expected one of vergence:PATH"),
         (["run", "vergence:/nowhere/at/all"], 2, "no such folder"),
@@ -138,14 +138,14 @@ def test_run_at_a_rate_accounts_for_every_frame(wall: Path, server: str, tmp_pat
     ids=["kind", "folder", "rate", "scheme", "nobody-there", "unwritable", "demo"],
 )
 def test_what_a_person_got_wrong_is_told_without_a_trace(
-    wall: Path, tmp_path: Path, arguments: list[str], code: int, told: str
+    wall: Path, tmp_path: Path, arguments: list[str], code: int, expected: str
 ) -> None:
     done = vergence(
         *(f"vergence:{wall}" if argument == "WALL" else argument for argument in arguments),
         cwd=tmp_path,
     )
     assert done.returncode == code
-    assert told in done.stderr
+    assert expected in done.stderr
     assert "Traceback" not in done.stderr
 
 

@@ -8,6 +8,7 @@ import pytest
 from tests.support.frames import RIG
 from tests.support.http import disparities, ended, http_to, submit
 from tests.support.models import RecallModel
+from tests.support.polling import eventually, eventually_true
 from tests.support.proxy import proxy_to
 from tests.support.sequences import make_frames, sequence_files, zip_bytes
 from tests.support.server import running_server
@@ -29,8 +30,7 @@ from vergence import (
     Superseded,
     UnknownStream,
 )
-from vergence_proto.geometry import RectifiedRig
-from vergence_proto.types import DisparityMap, StereoFrame
+from vergence_proto.types import DisparityMap, StereoFrame, StereoRig
 from vergence_service.app.server import Running, drain
 
 FRAMES = make_frames(6)
@@ -78,7 +78,8 @@ async def test_live_frames_come_back_and_the_stream_ends_with_the_session() -> N
 
 
 async def test_errors_are_those_that_the_server_raised() -> None:
-    backwards = RectifiedRig(64, 48, 60.0, 60.0, 31.5, 31.5, 23.5, -0.1)
+    straight = StereoRig.from_rectified(RIG)
+    backwards = StereoRig(straight.right, straight.left, straight.left_from_right.inverse())
     dark = make_frames(1)[0]
     dark.left[0, 0] = 254
     async with running_server(RecallModel()) as server, http_client(server) as client:
@@ -110,9 +111,7 @@ async def test_a_session_resumes_over_a_connection_that_broke() -> None:
             results = [await step(session, frame) for frame in FRAMES[:3]]
             proxy.cut()
             proxy.mend()
-            async with asyncio.timeout(10):
-                while EventKind.RESUMED not in [event.kind for event in events]:  # noqa: ASYNC110
-                    await asyncio.sleep(0.01)
+            await eventually(lambda: EventKind.RESUMED in [event.kind for event in events])
             results += [await step(session, frame) for frame in FRAMES[3:]]
         async with DepthClient(f"grpc://{server.grpc_address}") as client:
             undisturbed = await stepped(client)
@@ -127,9 +126,11 @@ async def test_a_client_that_vanished_leaves_its_stream_to_another() -> None:
             await session.__aenter__()
             await step(session, FRAMES[0])
             token = session.resume_token
-        async with asyncio.timeout(10):
-            while (await client.stream_info("roaming")).attached:  # noqa: ASYNC110
-                await asyncio.sleep(0.01)
+
+        async def is_detached() -> bool:
+            return not (await client.stream_info("roaming")).attached
+
+        await eventually_true(is_detached)
         taken = client.open_session(RIG, stream_id="roaming", resume_token=token)
         async with taken as again:
             assert (await step(again, FRAMES[1])).origin is Origin.RESUMED

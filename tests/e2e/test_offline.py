@@ -17,7 +17,7 @@ from vergence import (
 )
 from vergence_proto.datasets import StereoSource, open_source
 from vergence_proto.types import Plane
-from vergence_service.inference.model import RecurrentState, Step, View
+from vergence_service.inference.model import RecurrentState, Step, StereoView
 from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
 
 COLD, WARM = 4, 1
@@ -44,7 +44,9 @@ def stepped_by_hand(model: OnnxStereoModel, source: StereoSource) -> list[Plane]
     for each in source:
         frame = each.frame
         assert frame.pose is not None
-        view = View(frame.left, frame.right, rig, frame.capture_ns, frame.pose.world_from_left)
+        view = StereoView(
+            frame.left, frame.right, rig, frame.capture_ns, frame.pose.world_from_left
+        )
         [result] = model.step([Step(view, state, COLD if state is None else WARM)])
         offsets_px.append(result.offset_px)
         state = result.state

@@ -65,7 +65,7 @@ async def test_a_sequence_is_answered_alike_over_grpc_and_zenoh(delivery: Delive
 async def test_every_live_frame_is_accounted_for() -> None:
     model = RecallModel()
     async with (
-        lone_server(model, grpc__credit=5) as (_, address),
+        lone_server(model, streams__credit=5) as (_, address),
         DepthClient(address) as client,
         client.open_session(RIG) as session,
     ):
@@ -139,7 +139,7 @@ async def test_a_reset_lies_between_the_frames_it_was_sent_between() -> None:
 async def test_a_frame_over_the_limit_is_refused_and_the_stream_lives_on() -> None:
     big = np.zeros((480, 640, 3), np.uint8)
     async with (
-        lone_server(grpc__max_frame_mib=1) as (_, address),
+        lone_server(limits__max_frame_mib=1) as (_, address),
         DepthClient(address) as client,
         client.open_session(RIG) as session,
     ):

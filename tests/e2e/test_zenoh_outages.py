@@ -65,7 +65,7 @@ async def test_a_lossless_stream_outlives_its_router_and_loses_nothing() -> None
 
 
 def only(messages: str, key: str, size: int) -> dict[str, Any]:
-    """What a router lets pass: of the messages on a key, those of at most ``size`` bytes."""
+    """A router that lets only messages of at most ``size`` bytes pass on a key."""
     return {
         "flows": ["egress"],
         "messages": [messages],

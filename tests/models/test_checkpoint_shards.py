@@ -1,4 +1,4 @@
-"""Laws of large checkpoints: pieces small enough to travel, and a run that goes on from them."""
+"""Laws of large checkpoints: shards below 16 MiB, and a run that continues from them."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.support.clips import wall_clips
+from tests.support.wall_clips import wall_clips
 from vergence_models.config import Config, Precision, RaftNetworkConfig, TrainingConfig
 from vergence_models.data.clips import StereoClips
 from vergence_models.training import runs
-from vergence_models.training.checkpoint_shards import PIECE_BYTES, joined, split
+from vergence_models.training.checkpoint_shards import SHARD_BYTES, joined, split
 from vergence_models.training.runs import CHECKPOINT_NAME, RunError, load_checkpoint, read_run
 from vergence_models.training.trainer import Trainer
 
@@ -39,8 +39,8 @@ def clips() -> StereoClips:
 def in_pieces(monkeypatch: pytest.MonkeyPatch) -> int:
     """Pieces as small as the network, so that it makes several."""
     limit = 2**18
-    monkeypatch.setattr(runs, "PIECE_BYTES", limit)
-    monkeypatch.setattr("vergence_models.training.checkpoint_shards.PIECE_BYTES", limit)
+    monkeypatch.setattr(runs, "SHARD_BYTES", limit)
+    monkeypatch.setattr("vergence_models.training.checkpoint_shards.SHARD_BYTES", limit)
     return limit
 
 
@@ -124,7 +124,7 @@ def test_no_piece_is_larger_than_its_limit() -> None:
     tensors = {f"layer{number}": torch.randn(2**20) for number in range(20)}
     index, pieces = split({"weights": tensors, "scale": 2.0}, torch.float16)
     assert index["scale"] == 2.0
-    assert all(sum(t.nbytes for t in piece.values()) <= PIECE_BYTES for piece in pieces)
+    assert all(sum(t.nbytes for t in piece.values()) <= SHARD_BYTES for piece in pieces)
     back = joined(index, {name: value for piece in pieces for name, value in piece.items()})
     for name, value in tensors.items():
         assert torch.equal(back["weights"][name], value.half().float())

@@ -24,7 +24,9 @@ def sampled_at(image: Tensor, u: Tensor, v: Tensor) -> Tensor:
 
 
 def test_the_right_image_moved_by_the_disparity_is_the_left_image(clips: StereoClips) -> None:
-    left, right = (eye.flatten(0, 1).float() for eye in (clips.left, clips.right))
+    left, right = (
+        eye.flatten(0, 1).permute(0, 3, 1, 2).float() for eye in (clips.left, clips.right)
+    )
     disparity, visible = clips.disparity_px.flatten(0, 1), clips.visible.flatten(0, 1)
     v, u = torch.meshgrid(torch.arange(96.0), torch.arange(128.0), indexing="ij")
 

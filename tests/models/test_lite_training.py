@@ -10,13 +10,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.support.clips import wall_clips
+from tests.support.wall_clips import wall_clips
 from vergence_models.data.generator import ClipGenerator, GeneratorConfig
 from vergence_models.data.pool import ClipPool, write_shard
 from vergence_models.networks.lite.hypotheses import Hypotheses
 from vergence_models.studies.parts import PARTS, main, table_of_parts
 from vergence_models.studies.tables import read_tables
-from vergence_models.training.trainer import partly_foreign
+from vergence_models.training.trainer import Window, cutmix_state
 
 RUN = Path(__file__).parents[2] / "models" / "runs" / "lite"
 
@@ -34,13 +34,14 @@ def test_a_clip_that_is_too_short_is_played_to_and_fro(tmp_path: Path) -> None:
 
 
 @given(st.integers(0, 2**32))
-def test_a_state_is_foreign_in_one_window_and_nowhere_else(seed: int) -> None:
+def test_cutmix_replaces_one_window_of_a_state_and_nothing_else(seed: int) -> None:
     state = tuple(torch.randn(2, channels, 24, 32) for channels in (1, 5))
-    for own, mixed in zip(state, partly_foreign(state, np.random.default_rng(seed)), strict=True):
-        foreign = (mixed != own).all(dim=1)
-        assert torch.equal(mixed, torch.where(foreign[:, None], own.flip(0), own))
-        rows, columns = foreign[0].any(dim=1), foreign[0].any(dim=0)
-        assert torch.equal(foreign[0], rows[:, None] & columns)
+    window = Window.draw(np.random.default_rng(seed))
+    for own, mixed in zip(state, cutmix_state(state, window), strict=True):
+        replaced = (mixed != own).all(dim=1)
+        assert torch.equal(mixed, torch.where(replaced[:, None], own.flip(0), own))
+        rows, columns = replaced[0].any(dim=1), replaced[0].any(dim=0)
+        assert torch.equal(replaced[0], rows[:, None] & columns)
         for edges in (rows, columns):
             assert edges.int().diff().abs().sum() <= 2
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.support.clips import wall_clips
+from tests.support.wall_clips import wall_clips
 from vergence_models.data.pool import write_shard
 from vergence_models.evaluate import main
 from vergence_models.evaluation.metric_accumulator import settled_frame

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from torch import nn
 
 from tests.support.trained import as_trained
-from vergence_models.config import Config, Kind, LiteNetworkConfig
+from vergence_models.config import Config, LiteNetworkConfig, StepKind
 from vergence_models.evaluate import WEIGHTS
-from vergence_models.evaluation.stepping import OnnxNetwork
+from vergence_models.evaluation.stepping import OnnxNetwork, StepInputs
 from vergence_models.export import (
     PARITY_PX,
     check_parity,
@@ -26,7 +26,7 @@ from vergence_models.export import (
 )
 from vergence_models.networks.layers import all_pairs, banded, best_rival
 from vergence_models.networks.lite.network import LiteNetwork, LiteState
-from vergence_models.onnx_export.modules import COLUMNS, Part, export_part
+from vergence_models.onnx_export.modules import COLUMNS, GraphPart, export_part
 from vergence_models.training.runs import Run
 
 HEIGHT, WIDTH = 192, 256
@@ -69,9 +69,11 @@ def test_the_graph_equals_pytorch_frame_by_frame(
     # Under pytest's capture the tracer would format every symbolic shape it meets: minutes of it.
     monkeypatch.setattr(logging.getLogger("torch.__trace"), "propagate", False)
     run = Run("lite", network.config, network.state_dict(), story={}, measured={})
-    export_run(run, Config("lite", network.config, iterations=(1, 2), closer={2: 1}), tmp_path)
+    export_run(
+        run, Config("lite", network.config, iterations=(1, 2), iterations_at_2x={2: 1}), tmp_path
+    )
     graphs = OnnxNetwork(tmp_path, "lite")
-    for kind in (Kind(1), Kind(2), Kind(2, closer=1)):
+    for kind in (StepKind(1), StepKind(2), StepKind(2, at_2x=1)):
         assert check_parity(network, graphs, kind, frames=4) < PARITY_PX
     # Both counts begin with the same two graphs.
     assert graphs.card.graphs[1][0] == graphs.card.graphs[2][0]
@@ -120,9 +122,8 @@ def test_a_row_of_a_batch_does_not_hear_its_neighbours(shipped: OnnxNetwork) -> 
 
     def step(rows: list[int]) -> list[NDArray[np.float32]]:
         left, right = (np.concatenate([pair[eye] for pair in pairs])[rows] for eye in (0, 1))
-        disparity, sigma, following = shipped.run(
-            left, right, matrix[rows], tuple(t[rows] for t in state), 1
-        )
+        inputs = StepInputs(left, right, matrix[rows], tuple(t[rows] for t in state))
+        disparity, sigma, following = shipped.run(inputs, 1)
         return [disparity, sigma, *following]
 
     # To the bit, in batches of one size; how a kernel sums may depend on how many rows there are.
@@ -135,9 +136,9 @@ def test_a_row_of_a_batch_does_not_hear_its_neighbours(shipped: OnnxNetwork) -> 
 def test_shipped_graphs_agree_whatever_the_size(shipped: OnnxNetwork) -> None:
     for height, width in ((192, 224), (224, 256), (480, 640)):
         left, right = shifted_pair(height, width, 4)
-        disparity, sigma, following = shipped.run(
-            left, right, np.eye(4, dtype=np.float32)[None], shipped.cold_state(height, width), 4
-        )
+        still, nothing = np.eye(4, dtype=np.float32)[None], shipped.cold_state(height, width)
+        inputs = StepInputs(left, right, still, nothing)
+        disparity, sigma, following = shipped.run(inputs, 4)
         assert disparity.shape == sigma.shape == (1, height, width)
         assert disparity.min() > 0
         assert sigma.min() > 0
@@ -188,7 +189,9 @@ class Clamped(nn.Module):
 
 def test_a_clamp_to_a_size_is_one_operator(tmp_path: Path) -> None:
     path = tmp_path / "clamped.onnx"
-    export_part(Part(Clamped(), (torch.zeros(1, 16),), ({1: 8 * COLUMNS},), ("x",), ("y",)), path)
+    export_part(
+        GraphPart(Clamped(), (torch.zeros(1, 16),), ({1: 8 * COLUMNS},), ("x",), ("y",)), path
+    )
     operators = [node.op_type for node in onnx.load(path).graph.node]
     assert operators.count("Clip") == 1
     assert not {"Max", "Min"} & set(operators)

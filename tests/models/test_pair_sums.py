@@ -21,9 +21,9 @@ from onnx import ModelProto, TensorProto, helper, numpy_helper
 
 from vergence_models.evaluate import WEIGHTS
 from vergence_models.onnx_export.pair_sums import MOST, in_safe_parts, largest_pair, overflowing
-from vergence_models.onnx_export.quantization_plan import plan
-from vergence_models.onnx_export.quantize import Scale, quantized
-from vergence_models.onnx_export.rounding import Inputs
+from vergence_models.onnx_export.quantization_plan import plan_quantization
+from vergence_models.onnx_export.quantize import ByteScale, quantized
+from vergence_models.onnx_export.rounding import PatchStatistics
 from vergence_proto.model_io import MANIFEST_NAME
 
 Array = NDArray[Any]
@@ -62,7 +62,7 @@ def packed_orders(weights: Array, seed: int) -> Iterator[Array]:
 
 
 def saturates(weights: Array, seed: int = 0) -> bool:
-    """Whether some bytes and some order of int8 weights [O, K] give a wrong sum."""
+    """True if some bytes and some order of int8 weights [O, K] lead to a wrong sum."""
     return any(
         not np.array_equal(
             added_in_pairs(
@@ -76,7 +76,7 @@ def saturates(weights: Array, seed: int = 0) -> bool:
 
 
 def as_int8(
-    weight: NDArray[np.float32], inputs: Inputs | None = None
+    weight: NDArray[np.float32], inputs: PatchStatistics | None = None
 ) -> tuple[Array, Array, Array]:
     """The int8 weights [O, ...], steps and bias [O] that the exporter gives a convolution."""
     constant = numpy_helper.from_array(weight, "weight")
@@ -88,8 +88,8 @@ def as_int8(
         [constant],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
-    what = plan(model)
-    scales = {name: Scale.of_range(0, 1) for name in what.measured}
+    what = plan_quantization(model)
+    scales = {name: ByteScale.of_range(0, 1) for name in what.measured}
     made = quantized(model, what, scales, {} if inputs is None else {"found": inputs})
     assert overflowing(made) == []
     kept = {tensor.name: numpy_helper.to_array(tensor) for tensor in made.graph.initializer}
@@ -122,12 +122,12 @@ def test_int8_weights_give_exact_sums_in_any_order(weight: NDArray[np.float32], 
     assert (step <= np.maximum(2 * largest / 127, 1.1e-12)).all()
 
 
-def inputs_like(seed: int, count: int) -> tuple[Reals, Inputs]:
+def inputs_like(seed: int, count: int) -> tuple[Reals, PatchStatistics]:
     """Samples [N, count] of inputs that vary together, and their statistics."""
     random = np.random.default_rng(seed)
     causes = random.uniform(0, 1, (500, 3))
     seen = causes @ random.uniform(0, 1, (3, count)) + 0.02 * random.normal(size=(500, count))
-    return seen, Inputs(seen.mean(axis=0), np.cov(seen.T, bias=True))
+    return seen, PatchStatistics(seen.mean(axis=0), np.cov(seen.T, bias=True))
 
 
 @settings(deadline=None, max_examples=60)
@@ -150,7 +150,7 @@ def test_taking_over_errors_makes_sums_better(seed: int) -> None:
     seen, inputs = inputs_like(seed, weight[0].size)
     expected = seen @ weight.reshape(8, -1).T
 
-    def error(given: Inputs | None) -> float:
+    def error(given: PatchStatistics | None) -> float:
         values, step, bias = as_int8(weight, given)
         found = seen @ (values.reshape(8, -1) * step[:, None].astype(np.float64)).T + bias
         return float(np.square(found - expected).mean())

@@ -48,7 +48,7 @@ def test_windows_flips_and_reversal_keep_the_geometry(
     stored = ClipPool(tmp_path)
     for chances in ({"reverse": 1.0}, {"flip": 1.0}, {"skip": 1.0}):
         batch = stored.sample(rng, 1, frames=2, crop=(96, 80), **chances)
-        assert batch.left.shape == (1, 2, 3, 80, 96)
+        assert batch.left.shape == (1, 2, 80, 96, 3)
         assert agreement(batch, 0) > 0.93, chances
 
 

@@ -13,8 +13,8 @@ import pytest
 from numpy.typing import NDArray
 from onnx import ModelProto, NodeProto, TensorProto, helper, numpy_helper
 
-from tests.support.clips import wall_clips
-from vergence_models.config import Kind
+from tests.support.wall_clips import wall_clips
+from vergence_models.config import StepKind
 from vergence_models.data.clips import StereoClips
 from vergence_models.data.pool import ClipPool, write_shard
 from vergence_models.onnx_export.calibrate import (
@@ -25,8 +25,8 @@ from vergence_models.onnx_export.calibrate import (
     scales_of,
     steps,
 )
-from vergence_models.onnx_export.quantization_plan import Plan, plan
-from vergence_models.onnx_export.quantize import Scale, quantized, with_weights_apart
+from vergence_models.onnx_export.quantization_plan import QuantizationPlan, plan_quantization
+from vergence_models.onnx_export.quantize import ByteScale, quantized, with_weights_apart
 from vergence_proto.model_io import StateTensor
 
 STATES = (StateTensor("disparity", 1, 4),)
@@ -102,7 +102,7 @@ def wall_model(*, outlier: float = 0.0) -> ModelProto:
 
 def answer_of(model: ModelProto) -> NDArray[np.float32]:
     clips = wall_clips(1)
-    left, right = (eye[:, 0].permute(0, 2, 3, 1).numpy() for eye in (clips.left, clips.right))
+    left, right = (image.numpy() for image in clips.pair(0))
     session = onnxruntime.InferenceSession(
         model.SerializeToString(), providers=["CPUExecutionProvider"]
     )
@@ -116,7 +116,9 @@ def answer_of(model: ModelProto) -> NDArray[np.float32]:
     return disparity
 
 
-def found_scales(model: ModelProto, what: Plan, clips: StereoClips) -> dict[str, Scale]:
+def found_scales(
+    model: ModelProto, what: QuantizationPlan, clips: StereoClips
+) -> dict[str, ByteScale]:
     return scales_of(steps(model, STATES, clips, what.measured), what.measured)
 
 
@@ -128,7 +130,7 @@ def pool(tmp_path: Path) -> ClipPool:
 
 def test_an_int8_graph_answers_nearly_the_same() -> None:
     model = wall_model()
-    what = plan(model)
+    what = plan_quantization(model)
     scales = found_scales(model, what, wall_clips(2))
     expected, got = answer_of(model), answer_of(quantized(model, what, scales))
     step = float(scales["next_disparity"].step)
@@ -138,7 +140,7 @@ def test_an_int8_graph_answers_nearly_the_same() -> None:
 
 def test_convolutions_of_features_become_bytes_and_images_stay() -> None:
     model = wall_model()
-    what = plan(model)
+    what = plan_quantization(model)
     assert what.convolutions == {"a", "b", "next_disparity"}
     scales = found_scales(model, what, wall_clips(1))
     graph = quantized(model, what, scales).graph
@@ -182,7 +184,7 @@ def with_a_wider_view(model: ModelProto) -> ModelProto:
 
 def test_bytes_are_put_together_and_doubled_as_they_are() -> None:
     model = with_a_wider_view(wall_model())
-    what = plan(model)
+    what = plan_quantization(model)
     scales = found_scales(model, what, wall_clips(2))
     int8 = quantized(model, what, scales)
     step = float(scales["next_disparity"].step)
@@ -210,7 +212,7 @@ def test_split_weights_become_constants_of_their_own() -> None:
 
 @pytest.mark.parametrize(("low", "high"), [(-1.0, 1.0), (0.0, 6.0), (2.0, 5.0), (-3.0, -1.0)])
 def test_a_scale_covers_its_range_and_zero_is_exact(low: float, high: float) -> None:
-    scale = Scale.of_range(low, high)
+    scale = ByteScale.of_range(low, high)
     ends = [float(scale.step) * (byte - int(scale.zero)) for byte in (0, 255)]
     tolerance = float(scale.step)  # zero sits on a whole byte
     assert ends[0] <= min(low, 0.0) + tolerance
@@ -220,13 +222,15 @@ def test_a_scale_covers_its_range_and_zero_is_exact(low: float, high: float) -> 
 def test_graphs_are_made_and_the_loss_is_told(pool: ClipPool) -> None:
     wall = wall_model()
     before = wall.SerializeToString()
-    models, told = make_int8({Kind(1): wall, Kind(2): wall}, STATES, pool, max_disparity_px=192)
+    models, told = make_int8(
+        {StepKind(1): wall, StepKind(2): wall}, STATES, pool, max_disparity_px=192
+    )
     story = cast("dict[str, Any]", told)
     assert story["convolutions"] == 3
     assert story["measured_clips"] == 2
     assert 0 < story["float_epe_px"] < 1
     assert 0 < story["epe_px"] < MAX_LOSS * story["float_epe_px"]
-    assert set(models) == {Kind(1), Kind(2)}
+    assert set(models) == {StepKind(1), StepKind(2)}
     for model in models.values():
         operators = {node.op_type for node in model.graph.node}
         assert {"QuantizeLinear", "DequantizeLinear"} <= operators
@@ -235,4 +239,4 @@ def test_graphs_are_made_and_the_loss_is_told(pool: ClipPool) -> None:
 
 def test_what_loses_too_much_is_refused(pool: ClipPool) -> None:
     with pytest.raises(QuantizationError, match="1 iterations: EPE"):
-        make_int8({Kind(1): wall_model(outlier=3000.0)}, STATES, pool, max_disparity_px=192)
+        make_int8({StepKind(1): wall_model(outlier=3000.0)}, STATES, pool, max_disparity_px=192)

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from onnx import ModelProto, NodeProto, TensorProto, helper, numpy_helper
 
-from vergence_models.onnx_export.quantization_plan import plan
-from vergence_models.onnx_export.quantize import Scale, quantized
+from vergence_models.onnx_export.quantization_plan import plan_quantization
+from vergence_models.onnx_export.quantize import ByteScale, quantized
 
 Array = NDArray[Any]
 
@@ -63,7 +63,7 @@ def test_sums_of_an_image_are_whole_numbers(seed: int, largest: int) -> None:
         {"image": TensorProto.UINT8},
         "sums",
     )
-    what = plan(model)
+    what = plan_quantization(model)
     assert not what.measured
     image = random.integers(0, 256, (2, 3, 8, 3)).astype(np.uint8)
     made = quantized(model, what, {})
@@ -81,7 +81,7 @@ def test_a_product_with_fractions_stays_real() -> None:
         {"image": TensorProto.UINT8},
         "sums",
     )
-    assert "MatMulInteger" not in operators(quantized(model, plan(model), {}))
+    assert "MatMulInteger" not in operators(quantized(model, plan_quantization(model), {}))
 
 
 def scores_model(*, read: list[NodeProto]) -> ModelProto:
@@ -106,13 +106,13 @@ def features(seed: int) -> dict[str, Array]:
 def test_scores_that_are_only_looked_up_become_bytes() -> None:
     gather = node("GatherElements", "row index", "some", axis=1)
     model = scores_model(read=[gather, node("Neg", "some", "found")])
-    what = plan(model)
+    what = plan_quantization(model)
     assert what.products == {"scores"}
     assert what.measured == ["a", "b", "scores"]
     feeds = features(1)
     exact = np.matmul(feeds["a"], feeds["b"])
-    step = Scale.of_range(float(exact.min()), float(exact.max()))
-    scales = {"a": Scale.of_range(-1, 1), "b": Scale.of_range(-1, 1), "scores": step}
+    step = ByteScale.of_range(float(exact.min()), float(exact.max()))
+    scales = {"a": ByteScale.of_range(-1, 1), "b": ByteScale.of_range(-1, 1), "scores": step}
     made = quantized(model, what, scales)
     # Half a step of either factor, 16 times, and of the result.
     tolerance = 16 * float(scales["a"].step) + float(step.step)
@@ -132,4 +132,4 @@ def test_scores_that_something_else_reads_stay_real() -> None:
             node("Sub", "some most", "found"),
         ]
     )
-    assert not plan(model).products
+    assert not plan_quantization(model).products

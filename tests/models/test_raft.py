@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from tests.support.trained import as_trained
-from vergence_models.config import Config, Kind, RaftNetworkConfig
+from vergence_models.config import Config, RaftNetworkConfig, StepKind
 from vergence_models.evaluation.stepping import OnnxNetwork
 from vergence_models.export import PARITY_PX, check_parity, export_run, shifted_pair
 from vergence_models.networks.raft.network import RaftNetwork, RaftState
@@ -70,7 +70,7 @@ def test_exported_graphs_equal_pytorch_and_share_their_weights(tmp_path: Path) -
     weights = tmp_path / "full.weights"
     graphs = OnnxNetwork(tmp_path, "full")
     for count, ((path,),) in card.graphs.items():
-        assert check_parity(network, graphs, Kind(count), frames=4) < PARITY_PX
+        assert check_parity(network, graphs, StepKind(count), frames=4) < PARITY_PX
         kinds = {node.op_type for node in onnx.load(path, load_external_data=False).graph.node}
         assert not kinds & {"BatchNormalization", "Loop", "If"}
     stored = sum(p.numel() * 4 for p in folded(network).parameters())

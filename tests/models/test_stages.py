@@ -10,12 +10,12 @@ import pytest
 from numpy.typing import NDArray
 from onnx import ModelProto, NodeProto, TensorProto, helper, numpy_helper
 
-from vergence_models.config import Kind
+from vergence_models.config import StepKind
 from vergence_models.onnx_export.stages import StageError, handed_on, in_stages
-from vergence_models.onnx_export.stitch import CloserLook, Parts, stitched
+from vergence_models.onnx_export.stitch import RefinementAt2x, StepParts, stitched
 
 Array = NDArray[Any]
-KINDS = (Kind(1), Kind(3), Kind(3, closer=1))
+KINDS = (StepKind(1), StepKind(3), StepKind(3, at_2x=1))
 
 
 def part(
@@ -33,9 +33,9 @@ def node(op: str, inputs: str, output: str) -> NodeProto:
     return helper.make_node(op, inputs.split(), [output], name=output)
 
 
-def parts() -> Parts[ModelProto]:
+def parts() -> StepParts[ModelProto]:
     """state = state * 0.5 + left * 3 + right / 7, over and over; then twice that."""
-    return Parts(
+    return StepParts(
         begin=(
             part(
                 [node("Mul", "left weight", "near"), node("Neg", "state", "at_state")],
@@ -56,7 +56,7 @@ def parts() -> Parts[ModelProto]:
             0.5,
         ),
         end=part([node("Mul", "at_state weight", "answer")], ["at_state"], ["answer"], 2.0),
-        closer=CloserLook(
+        at_2x=RefinementAt2x(
             enter=part(
                 [
                     node("Add", "left weight", "to_left"),
@@ -81,18 +81,18 @@ def parts() -> Parts[ModelProto]:
     )
 
 
-def computed(kind: Kind, left: Array, right: Array, state: Array) -> Array:
-    """What :func:`parts` say, in numpy."""
+def computed(kind: StepKind, left: Array, right: Array, state: Array) -> Array:
+    """The result of :func:`parts`, in numpy."""
 
     def iterated(left: Array, right: Array, state: Array, count: int) -> Array:
         for _ in range(count):
             state = state * np.float32(0.5) + left * np.float32(3) + right / np.float32(7)
         return state
 
-    plain = 2 * iterated(left, right, -state, kind.iterations - kind.closer)
-    if not kind.closer:
+    plain = 2 * iterated(left, right, -state, kind.iterations - kind.at_2x)
+    if not kind.at_2x:
         return plain
-    again = 2 * iterated(left + 11, right - 11, plain * 11, kind.closer)
+    again = 2 * iterated(left + 11, right - 11, plain * 11, kind.at_2x)
     joined: Array = (plain - again) / np.float32(13)
     return joined
 
@@ -134,10 +134,10 @@ def test_a_graph_holds_only_its_own() -> None:
     assert kept["tiny_begin_0.onnx"] == {"begin_0.weight"}
     assert kept["tiny_begin_1.onnx"] == {"begin_1.weight"}
     assert kept["tiny_3.onnx"] == {"iterate.weight", "end.weight"}
-    # A closer look begins anew, and where its state lies is not computed again.
-    closer = {f"closer_begin_{number}.{name}" for number, name in enumerate(("near", "far"))}
+    # 2x refinement runs the first part again, but does not warp its state.
+    at_2x = {f"closer_begin_{number}.{name}" for number, name in enumerate(("near", "far"))}
     made = {name for each in files["tiny_3_cold.onnx"].graph.node for name in each.output}
-    assert closer < made
+    assert at_2x < made
     assert "closer_begin_0.at_state" not in made
     assert [entry.name for entry in files["tiny_begin_1.onnx"].graph.input] == ["right"]
 
@@ -145,8 +145,8 @@ def test_a_graph_holds_only_its_own() -> None:
 def test_a_beginning_that_depends_on_the_count_is_refused() -> None:
     models = {kind: stitched(parts(), kind) for kind in KINDS}
     (weight,) = (
-        each for each in models[Kind(3)].graph.initializer if each.name == "begin_1.weight"
+        each for each in models[StepKind(3)].graph.initializer if each.name == "begin_1.weight"
     )
     weight.CopyFrom(numpy_helper.from_array(np.array([8.0], np.float32), "begin_1.weight"))
-    with pytest.raises(StageError, match=r"tiny_begin_1\.onnx: is another in tiny_3 than"):
+    with pytest.raises(StageError, match=r"tiny_begin_1\.onnx: tiny_3 needs another graph than"):
         in_stages("tiny", models, handed_on(parts()))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.support.weights_copy import WEIGHTS, Entry, copied_weights
-from vergence_models.evaluation.stepping import OnnxNetwork
+from vergence_models.evaluation.stepping import OnnxNetwork, StepInputs
 
 HEIGHT, WIDTH = 40, 70
 
@@ -19,8 +19,8 @@ def test_stages_answer_bit_for_bit_what_the_whole_graph_answers(threads: int) ->
     for iterations in (2, 1, 1):
         left, right = random.integers(0, 255, (2, 2, HEIGHT, WIDTH, 3), np.uint8)
         motion = random.uniform(-1, 1, (2, 4, 4)).astype(np.float32)
-        disparity, sigma, state = whole.run(left, right, motion, state, iterations)
-        in_stages, its_sigma, once = staged.run(left, right, motion, once, iterations)
+        disparity, sigma, state = whole.run(StepInputs(left, right, motion, state), iterations)
+        in_stages, its_sigma, once = staged.run(StepInputs(left, right, motion, once), iterations)
         np.testing.assert_array_equal(in_stages, disparity)
         np.testing.assert_array_equal(its_sigma, sigma)
         np.testing.assert_array_equal(once, state)
@@ -36,8 +36,8 @@ def test_a_start_runs_the_cold_graphs(tmp_path: Path) -> None:
     still, nothing = np.eye(4, dtype=np.float32)[None], network.cold_state(HEIGHT, WIDTH)
     started, once, twice = (
         network.start(left, right, 1),
-        network.run(left, right, still, nothing, 1),
-        network.run(left, right, still, nothing, 2),
+        network.run(StepInputs(left, right, still, nothing), 1),
+        network.run(StepInputs(left, right, still, nothing), 2),
     )
     np.testing.assert_array_equal(started[0], twice[0])
     assert not np.array_equal(started[0], once[0])

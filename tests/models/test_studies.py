@@ -11,7 +11,7 @@ import torch
 from rich.console import Console
 from rich.progress import Progress
 
-from tests.support.clips import wall_clips
+from tests.support.wall_clips import wall_clips
 from vergence_models.data.generator import ClipGenerator, GeneratorConfig
 from vergence_models.data.shots import Playback
 from vergence_models.evaluate import WEIGHTS
@@ -23,16 +23,9 @@ from vergence_models.evaluation.methods import (
 )
 from vergence_models.evaluation.stepping import Footage, SteppedNetwork, footage_from_clip
 from vergence_models.onnx_export.calibrate import PARITY_PX
-from vergence_models.studies.__main__ import main
+from vergence_models.studies.__main__ import main, missing_tiers
 from vergence_models.studies.bench import Bench
-from vergence_models.studies.footage import SPEEDS, StudySettings
-from vergence_models.studies.learning import learning_curves
-from vergence_models.studies.networks import (
-    Contender,
-    gather_contenders,
-    missing_tiers,
-)
-from vergence_models.studies.plan import (
+from vergence_models.studies.experiments import (
     STUDIES,
     cold_start,
     every_method,
@@ -41,7 +34,13 @@ from vergence_models.studies.plan import (
     pose_noise,
     warp_ablation,
 )
-from vergence_models.studies.tables import Table, markdown, read_tables, write_tables
+from vergence_models.studies.footage import SPEEDS, StudySettings
+from vergence_models.studies.learning import learning_curves
+from vergence_models.studies.networks import (
+    StudiedNetwork,
+    gather_networks,
+)
+from vergence_models.studies.tables import Table, TableRow, markdown, read_tables, write_tables
 from vergence_models.training.runs import RunError, read_history, read_run
 
 RUN = Path(__file__).parents[2] / "models" / "runs" / "lite"
@@ -54,13 +53,13 @@ def wall() -> Footage:
 
 
 @pytest.fixture(scope="module")
-def contenders() -> list[Contender]:
-    return gather_contenders([WEIGHTS], [], threads=1)
+def networks() -> list[StudiedNetwork]:
+    return gather_networks([WEIGHTS], [], threads=1)
 
 
 @pytest.fixture(scope="module")
-def network(contenders: list[Contender]) -> SteppedNetwork:
-    return contenders[0].network
+def network(networks: list[StudiedNetwork]) -> SteppedNetwork:
+    return networks[0].network
 
 
 @pytest.fixture(scope="module")
@@ -68,14 +67,14 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("clips")
 
 
-def new_bench(contenders: list[Contender], cache: Path) -> Bench:
+def new_bench(networks: list[StudiedNetwork], cache: Path) -> Bench:
     progress = Progress(console=Console(quiet=True))
-    return Bench(contenders, settings=TINY, cache=cache, workers=1, progress=progress)
+    return Bench(networks, settings=TINY, cache=cache, workers=1, progress=progress)
 
 
 @pytest.fixture(scope="module")
-def bench(contenders: list[Contender], cache: Path) -> Bench:
-    return new_bench(contenders, cache)
+def bench(networks: list[StudiedNetwork], cache: Path) -> Bench:
+    return new_bench(networks, cache)
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +140,7 @@ def test_a_state_that_is_not_moved_is_that_of_a_camera_that_stands_still(
         wall,
         views=[replace(v, world_from_left=wall.views[0].world_from_left) for v in wall.views],
     )
-    not_moved = list(warm.told("state not moved", without_poses).predict(wall))
+    not_moved = list(warm.with_input("state not moved", without_poses).predict(wall))
     moved = list(warm.predict(wall))
     for found, expected in zip(not_moved, warm.predict(still), strict=True):
         np.testing.assert_array_equal(found.disparity_px, expected.disparity_px)
@@ -174,16 +173,16 @@ def test_studies_agree_with_one_another(tables: dict[str, Table]) -> None:
 
 
 def test_the_same_seed_gives_the_same_tables(
-    tables: dict[str, Table], contenders: list[Contender], tmp_path: Path
+    tables: dict[str, Table], networks: list[StudiedNetwork], tmp_path: Path
 ) -> None:
-    again = new_bench(contenders, tmp_path)  # renders its clips anew
+    again = new_bench(networks, tmp_path)  # renders its clips anew
     assert warp_ablation(again) == tables["warp"]
 
 
 def test_a_run_adds_only_the_counts_that_no_graph_has(
     network: SteppedNetwork, wall: Footage
 ) -> None:
-    graphs, run = gather_contenders([WEIGHTS], [RUN], threads=1)
+    graphs, run = gather_networks([WEIGHTS], [RUN], threads=1)
     assert not set(graphs.warm) & set(run.warm)
     assert not set(graphs.single_frame) & set(run.single_frame)
     assert run.training.runtime == "PyTorch"
@@ -195,10 +194,28 @@ def test_a_run_adds_only_the_counts_that_no_graph_has(
         assert np.quantile(difference, 0.99) < PARITY_PX
 
 
-def test_a_tier_without_weights_is_named(contenders: list[Contender]) -> None:
-    only = [contender for contender in contenders if contender.tier == "lite"]
-    assert missing_tiers(only) == ["full", "fast"]
-    assert "`full`, `fast`" in markdown([], missing_tiers(only), [])
+def test_a_tier_without_weights_is_named(tables: dict[str, Table]) -> None:
+    only_lite = list(tables.values())
+    assert missing_tiers(only_lite) == ["full", "fast"]
+    assert "`full`, `fast`" in markdown([], missing_tiers(only_lite), [])
+
+
+def test_a_column_has_the_same_decimals_in_every_row() -> None:
+    rows = [TableRow("slow", {"ms": 1820.0, "epe": 0.5}), TableRow("quick", {"ms": 7.91})]
+    table = Table("t", "T", "", {"ms": "ms", "epe": "EPE"}, rows, training=[])
+    text = markdown([table], [], [])
+    assert "| slow | 1820.0 | 0.50 |" in text
+    assert "| quick | 7.9 |  |" in text
+
+
+def test_markdown_is_written_again_without_running_a_study(
+    tables: dict[str, Table], tmp_path: Path
+) -> None:
+    path = tmp_path / "studies.json"
+    write_tables(path, [tables["speed"]])
+    main(["--json", str(path), "--render"])
+    assert tables["speed"].title in path.with_suffix(".md").read_text()
+    assert read_tables(path) == {"speed": tables["speed"]}
 
 
 def test_tables_survive_their_file(tables: dict[str, Table], tmp_path: Path) -> None:
@@ -250,8 +267,8 @@ def test_every_study_has_a_name_of_its_own() -> None:
 
 
 def test_learning_curves_are_those_of_the_log(cache: Path, tmp_path: Path) -> None:
-    contenders = gather_contenders([WEIGHTS], [RUN], threads=1)
-    table = learning_curves(new_bench(contenders, cache))
+    networks = gather_networks([WEIGHTS], [RUN], threads=1)
+    table = learning_curves(new_bench(networks, cache))
     assert table.rows[-1].values["warm_epe"] == read_run(RUN).measured["warm_epe"]
     for curve in table.curves:
         assert curve.x == sorted(curve.x)

@@ -1,4 +1,4 @@
-"""Laws of the closer look: what is larger comes back as it was, and the surer of two is kept."""
+"""Laws of 2x refinement: downsampling restores a state, and the surer of two results is kept."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from torch import Tensor
 
 from vergence_models.config import FAST_NETWORK, LiteNetworkConfig
 from vergence_models.evaluate import WEIGHTS
-from vergence_models.evaluation.stepping import OnnxNetwork
-from vergence_models.networks.base import Found
+from vergence_models.evaluation.stepping import OnnxNetwork, StepInputs
+from vergence_models.networks.base import StepOutput
 from vergence_models.networks.lite.network import LiteNetwork
 from vergence_models.networks.lite.upscaled import (
     ELSEWHERE_PX,
@@ -50,11 +50,11 @@ def test_a_state_comes_back_as_it_was(seed: int) -> None:
     assert torch.allclose(halved(larger_hidden), hidden, rtol=1e-5, atol=1e-6)
 
 
-def found(disparity_px: Tensor, sigma_px: Tensor) -> Found:
+def found(disparity_px: Tensor, sigma_px: Tensor) -> StepOutput:
     """At any size; the state has the disparity of the middle of its cells."""
     height, width = disparity_px.shape[1:]
     state = disparity_px[:, None, 2::4, 2::4], torch.zeros(1, 3, height // 8, width // 8)
-    return Found(disparity_px, sigma_px, state)
+    return StepOutput(disparity_px, sigma_px, state)
 
 
 def twice(plane: Tensor) -> Tensor:
@@ -84,27 +84,27 @@ def test_each_pixel_keeps_one_of_two_and_the_state_agrees(seed: int) -> None:
     assert hidden.shape == (1, 3, HEIGHT // 8, WIDTH // 8)
 
 
-def test_a_cold_step_without_a_closer_look_is_any_first_step() -> None:
+def test_a_cold_step_without_2x_refinement_is_any_first_step() -> None:
     torch.manual_seed(5)
     network = LiteNetwork(LiteNetworkConfig()).eval()
     left, right = torch.randint(0, 255, (2, 1, 192, 256, 3), dtype=torch.uint8)
     with torch.inference_mode():
         cold = network.cold_step(left, right, 2)
         usual, _ = network(left, right, torch.eye(4)[None], network.cold_state(1, 192, 256), 2)
-        closer = network.cold_step(left, right, 2, closer=1)
+        at_2x = network.cold_step(left, right, 2, at_2x=1)
     assert torch.equal(cold.disparity, usual.disparity)
-    assert not torch.allclose(closer.disparity, usual.disparity, atol=0.1)
-    assert [each.shape for each in closer.state] == [each.shape for each in cold.state]
+    assert not torch.allclose(at_2x.disparity, usual.disparity, atol=0.1)
+    assert [each.shape for each in at_2x.state] == [each.shape for each in cold.state]
 
 
-def test_a_tier_without_a_closer_look_says_so() -> None:
+def test_a_tier_without_2x_refinement_says_so() -> None:
     network = RaftNetwork(FAST_NETWORK).eval()
     image = torch.zeros(1, 192, 256, 3, dtype=torch.uint8)
-    with pytest.raises(ValueError, match="RaftNetwork takes no closer look, got 1 iterations"):
-        network.cold_step(image, image, 2, closer=1)
+    with pytest.raises(ValueError, match="RaftNetwork cannot refine at 2x, got 1 iterations"):
+        network.cold_step(image, image, 2, at_2x=1)
 
 
-def test_a_closer_look_finds_bars_that_are_thinner_than_a_cell() -> None:
+def test_2x_refinement_finds_bars_that_are_thinner_than_a_cell() -> None:
     wall_px, bar_px, width = 6, 16, 3
     random = np.random.default_rng(11)
     left, right = (np.zeros((192, 256, 3), np.uint8) for _ in range(2))
@@ -118,7 +118,7 @@ def test_a_closer_look_finds_bars_that_are_thinner_than_a_cell() -> None:
         truth[:, column : column + width] = bar_px
     network = OnnxNetwork(WEIGHTS, "lite")
     still, nothing = np.eye(4, dtype=np.float32)[None], network.cold_state(192, 256)
-    plain, *_ = network.run(left[None], right[None], still, nothing, 8)
-    closer, *_ = network.start(left[None], right[None], 8)
-    missed = [np.mean(np.abs(each[0] - truth)[truth == bar_px] > 2) for each in (plain, closer)]
+    plain, *_ = network.run(StepInputs(left[None], right[None], still, nothing), 8)
+    at_2x, *_ = network.start(left[None], right[None], 8)
+    missed = [np.mean(np.abs(each[0] - truth)[truth == bar_px] > 2) for each in (plain, at_2x)]
     assert missed[1] < missed[0]

@@ -1,4 +1,4 @@
-"""What the final pass's camera does, against the clean one's pictures."""
+"""Laws of the final pass's camera, against the pictures of the clean pass."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vergence_models.data.xrbench.camera import Eye, StereoCamera
 from vergence_models.data.xrbench.denoise import denoised
 from vergence_models.data.xrbench.recipe import Effects, Recipe
 from vergence_models.data.xrbench.things import Panel, Room, Surface, Thing, Workbench
-from vergence_models.data.xrbench.tracer import Light, Optics, Tracer, View
+from vergence_models.data.xrbench.tracer import CameraView, Optics, TracedLight, Tracer
 
 STILL = Effects(exposure_s=0, readout_s=0, aperture_m=0, glare=0, flicker=0)
 OPTICS = Optics(64, 48, 60.0)
@@ -95,7 +95,7 @@ def board(*, sky: float = 0.0) -> Room:
     return Room((Thing("board", bench.parts(), np.eye(4)),), (lamp,), 5, sky, np.eye(4))
 
 
-def traced(room: Room, *, flicker: float = 1.0, view: View | None = None) -> Light:
+def traced(room: Room, *, flicker: float = 1.0, view: CameraView | None = None) -> TracedLight:
     tracer = Tracer(room, bounces=2, variant="scalar_rgb")
     return tracer.light(OPTICS, np.eye(4), 0.0, samples=16, seed=1, flicker=flicker, view=view)
 
@@ -111,7 +111,7 @@ def test_flicker_scales_the_light_of_the_lamps_and_no_other() -> None:
 
 def test_a_band_is_the_same_rows_of_the_whole_image() -> None:
     whole = traced(board()).albedo
-    band = traced(board(), view=View(first_row=30, rows=10)).albedo
+    band = traced(board(), view=CameraView(first_row=30, rows=10)).albedo
     assert band.shape == (10, 64, 3)
     # Other samples in each pixel: the pattern's edges differ by a little.
     difference = {row: np.abs(band - whole[row : row + 10]).mean() for row in range(25, 36)}
@@ -121,12 +121,12 @@ def test_a_band_is_the_same_rows_of_the_whole_image() -> None:
 
 @pytest.mark.parametrize("axis", [0, 1], ids=["down", "right"])
 def test_the_focus_stays_where_it_is_through_every_point_of_the_lens(axis: int) -> None:
-    """What is not in focus moves by focal length x lens point x difference of inverse depths."""
+    """A point out of focus moves by focal length x lens point x difference of inverse depths."""
     point_m = (0.1, 0.0) if axis == 1 else (0.0, 0.1)
     pinhole = traced(board()).albedo
 
     def through(focus_m: float) -> NDArray[np.float32]:
-        return traced(board(), view=View(0, 48, point_m, focus_m)).albedo
+        return traced(board(), view=CameraView(0, 48, point_m, focus_m)).albedo
 
     assert np.abs(through(2.0) - pinhole).mean() < 1e-4  # the board's own distance
     nearer = through(1.0)
@@ -146,7 +146,7 @@ def test_filtering_removes_noise_and_keeps_texture() -> None:
     normals = np.zeros((60, 80, 3), np.float32)
     normals[..., 2] = -1
     depth = np.full((60, 80, 1), 2.0, np.float32)
-    noisy = Light(albedo * noise, albedo, normals, depth)
+    noisy = TracedLight(albedo * noise, albedo, normals, depth)
     mirror = np.zeros((60, 80), np.bool_)
     mirror[5:9, 5:9] = True
     clean = denoised(noisy, mirror)

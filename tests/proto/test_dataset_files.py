@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as arrays
 
 from tests.support import dataset_trees as trees
 from vergence_proto.datasets import (
-    LayoutError,
+    DatasetError,
     read_disparity_png,
     read_image,
     read_pfm,
@@ -52,7 +52,7 @@ class TestDisparityPng:
         path = tmp_path / "disparity.png"
         write_disparity_png(path, trees.a_disparity())
         path.write_bytes(path.read_bytes()[:-20])
-        with pytest.raises(LayoutError, match=r"disparity\.png: the PNG of .* cut short"):
+        with pytest.raises(DatasetError, match=r"disparity\.png: the PNG of .* cut short"):
             read_disparity_png(path)
 
 
@@ -88,7 +88,7 @@ class TestPfm:
     def test_what_is_no_pfm_is_named(self, data: bytes, message: str, tmp_path: Path) -> None:
         path = tmp_path / "a.pfm"
         path.write_bytes(data)
-        with pytest.raises(LayoutError, match=message) as caught:
+        with pytest.raises(DatasetError, match=message) as caught:
             read_pfm(path)
         assert str(caught.value).startswith(f"{path}: ")
 
@@ -110,9 +110,9 @@ class TestImages:
         path = tmp_path / name
         trees.write_image(path, trees.an_image(0))
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-        with pytest.raises(LayoutError, match=name):
+        with pytest.raises(DatasetError, match=name):
             read_image(path)
 
     def test_a_missing_image_is_named(self, tmp_path: Path) -> None:
-        with pytest.raises(LayoutError, match=r"a\.png: not found"):
+        with pytest.raises(DatasetError, match=r"a\.png: not found"):
             read_image(tmp_path / "a.png")

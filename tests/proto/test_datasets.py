@@ -8,7 +8,7 @@ import pytest
 from tests.support import dataset_trees as trees
 from tests.support import field_trees
 from tests.support.sources import assert_images, assert_poses, assert_truth, rig_of
-from vergence_proto.datasets import LAYOUTS, find_sources, open_source
+from vergence_proto.datasets import DATASETS, find_sources, open_source
 from vergence_proto.geometry import RectifiedRig
 
 TREES = {**trees.TREES, **field_trees.TREES}
@@ -16,7 +16,7 @@ OPTIONS = {"sceneflow": "?fx=20"}
 
 
 def test_every_layout_has_a_tree_here() -> None:
-    assert set(TREES) == set(LAYOUTS)
+    assert set(TREES) == set(DATASETS)
 
 
 @pytest.mark.parametrize("kind", TREES)

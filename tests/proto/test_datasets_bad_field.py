@@ -66,7 +66,16 @@ CASES: dict[str, list[tuple[str, Change, str]]] = {
     ],
     "spring": [
         ("a short pose", _writing("cam_data/extrinsics.txt", "1 0 0"), "line 1: expected 16"),
-        ("no rotation", _writing("cam_data/extrinsics.txt", "1 " * 16), "expected a rotation"),
+        (
+            "no rotation",
+            _writing("cam_data/extrinsics.txt", "1 " * 12 + "0 0 0 1"),
+            "txt, line 1: expected a rotation",
+        ),
+        (
+            "a transposed pose",
+            _writing("cam_data/extrinsics.txt", "1 0 0 0 0 1 0 0 0 0 1 0 1 2 3 1"),
+            "txt, line 1: expected 0 0 0 1 as the last row",
+        ),
         ("words", _writing("cam_data/intrinsics.txt", "1 2 3 wide"), "txt, line 1: could not"),
         ("no numbers", _writing("cam_data/intrinsics.txt", ""), "got an empty file"),
         ("focal length", _writing("cam_data/intrinsics.txt", "0 0 1 1"), "must be positive"),
@@ -173,7 +182,7 @@ def test_an_empty_folder_says_what_was_expected(kind: str, tmp_path: Path) -> No
 @pytest.mark.parametrize("kind", field.TREES)
 def test_a_folder_above_names_what_it_holds(kind: str, tmp_path: Path) -> None:
     path = field.TREES[kind](tmp_path)
-    assert f"take one: {kind}:{path}" in opening(f"{kind}:{tmp_path}")
+    assert f"name one of them: {kind}:{path}" in opening(f"{kind}:{tmp_path}")
 
 
 def test_springs_truth_without_h5py_says_what_to_install(

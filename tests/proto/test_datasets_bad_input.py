@@ -67,7 +67,7 @@ VERGENCE = [
     ("a pose of words", _writing("poses.txt", "north " * 12), "poses.txt, line 1: could not"),
     ("no rotation", _writing("poses.txt", "1 " * 12), "poses.txt, line 1: expected a rotation"),
     ("a nan position", _writing("poses.txt", "1 0 0 nan 0 1 0 0 0 0 1 0"), "line 1: expected a"),
-    ("half a truth", _cut("frame_0000_gt.npz"), "frame_0000_gt.npz: no readable .npz"),
+    ("half a truth", _cut("frame_0000_gt.npz"), "frame_0000_gt.npz: expected a readable .npz"),
     ("truth without disp", _truth(d=np.zeros(3)), "gt.npz: expected an array 'disp', got d"),
     ("truth in floats", _truth(disp=np.zeros((16, 24))), "expected disp as uint16"),
     ("small truth", _truth(disp=np.zeros((8, 24), np.uint16)), "the truth of frame 1 is 24x8"),
@@ -142,7 +142,11 @@ TARTANAIR = [
     ("a short pose", _writing("pose_left.txt", "0 0 0 1"), "line 1: expected 7 numbers, got 4"),
     ("no unit quaternion", _writing("pose_left.txt", "0 0 0 0 0 0 0"), "line 1: expected a unit"),
     ("no depth", _without("depth_left/000001_left_depth.npy"), "left_depth.npy: not found"),
-    ("half a depth", _cut("depth_left/000001_left_depth.npy"), "depth.npy: no readable .npy"),
+    (
+        "half a depth",
+        _cut("depth_left/000001_left_depth.npy"),
+        "depth.npy: expected a readable .npy",
+    ),
     (
         "flat depth",
         lambda folder: np.save(folder / "depth_left/000001_left_depth.npy", np.zeros(3)),
@@ -198,7 +202,7 @@ def test_a_kitti_pair_that_lacks_a_file(year: int, missing: str, tmp_path: Path)
 @pytest.mark.parametrize("year", [2012, 2015])
 def test_a_folder_of_kitti_pairs_names_them(year: int, tmp_path: Path) -> None:
     path = trees.kitti_pair(tmp_path, year)
-    assert f"take one: kitti{year}:{path}" in opening(f"kitti{year}:{tmp_path}/training")
+    assert f"name one of them: kitti{year}:{path}" in opening(f"kitti{year}:{tmp_path}/training")
 
 
 def test_kitti_truth_must_have_sixteen_bits(tmp_path: Path) -> None:

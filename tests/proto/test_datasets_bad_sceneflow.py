@@ -42,7 +42,7 @@ def test_sceneflow_names_the_file(file: str, change: Change, message: str, tmp_p
 def test_sceneflow_asks_for_a_focal_length_it_cannot_know(tmp_path: Path) -> None:
     folder = trees.sceneflow_sequence(tmp_path)
     said = opening(f"sceneflow:{folder}")
-    assert "24x16 are not SceneFlow's own, and the layout states no focal length" in said
+    assert "24x16 are not SceneFlow's own, and no file states the focal length" in said
     assert f"add it: sceneflow:{folder}?fx=PIXELS" in said
 
 

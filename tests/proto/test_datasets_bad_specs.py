@@ -22,7 +22,9 @@ class TestSpecs:
             trees.vergence_sequence(tmp_path / name)
         message = opening(f"vergence:{tmp_path}")
         assert message.startswith(f"{tmp_path}/calib.json: not found")
-        assert f"take one: vergence:{tmp_path}/a/room, vergence:{tmp_path}/b/room" in message
+        assert (
+            f"name one of them: vergence:{tmp_path}/a/room, vergence:{tmp_path}/b/room" in message
+        )
 
     def test_a_large_tree_names_some_and_counts_the_rest(self, tmp_path: Path) -> None:
         for k in range(14):

@@ -10,8 +10,8 @@ from tests.support import dataset_trees as trees
 from tests.support import field_trees as field
 from tests.support.sources import assert_images, assert_poses, assert_truth, rig_of
 from tests.support.strategies import assert_same_pose
-from vergence.cli.play import source_at
-from vergence_proto.datasets import LAYOUTS, find_sources, open_source
+from vergence.cli.sources import source_at
+from vergence_proto.datasets import DATASETS, find_sources, open_source
 from vergence_proto.geometry import RectifiedRig
 
 ALL_TREES = {**trees.TREES, **field.TREES}
@@ -279,7 +279,7 @@ def everything(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-@pytest.mark.parametrize("kind", LAYOUTS)
+@pytest.mark.parametrize("kind", DATASETS)
 def test_a_kind_finds_its_own_tree_and_no_other(kind: str, everything: Path) -> None:
     found = [Path(spec.split(":", 1)[1]) for spec in find_sources(f"{kind}:{everything}")]
     takes = {path.relative_to(everything).parts[0] for path in found}
@@ -358,7 +358,7 @@ def test_images_alone_are_a_source_without_truth_poses_or_metres(kind: str, tmp_
     assert rig_of(source) == RectifiedRig(24, 16, 24, 24, 11.5, 11.5, 7.5, 0.1)
 
 
-@pytest.mark.parametrize("kind", LAYOUTS)
+@pytest.mark.parametrize("kind", DATASETS)
 def test_vergence_run_takes_the_kind(kind: str, tmp_path: Path) -> None:
     path = ALL_TREES[kind](tmp_path)
     assert len(source_at(f"{kind}:{path}{'?fx=20' if kind == 'sceneflow' else ''}")) > 0

@@ -1,4 +1,4 @@
-"""Rendered data sets give what they say, checked by formulas of the test's own."""
+"""Rendered data sets hold what they state, checked with formulas of the test's own."""
 
 from pathlib import Path
 

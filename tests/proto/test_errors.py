@@ -23,7 +23,7 @@ def test_the_wire_brings_back_the_class_that_was_raised(code: ErrorCode) -> None
     assert (str(back), back.retry_after_s) == ("too much", 0.5)
 
 
-def test_a_reason_from_a_newer_server_is_told_by_name() -> None:
+def test_a_reason_from_a_newer_server_is_reported_by_name() -> None:
     error = error_from_wire("LENS_COVERED", "take the cap off")
     assert type(error) is ModelFailed
     assert str(error) == "LENS_COVERED: take the cap off"

@@ -1,21 +1,22 @@
-"""Live first: other steps fill the gaps between live frames, and are not in the way of the next."""
+"""Live steps run first; other steps run in the gaps and do not delay the next live frame."""
 
 import asyncio
 from collections.abc import Sequence
 
 from tests.service.test_batcher import make_batcher, make_step
 from tests.support.models import RecallModel
+from tests.support.polling import PATIENCE_S, turns
 from tests.support.server import ManualClock
-from vergence_service.inference.arrivals import Due, LiveRhythm
+from vergence_service.inference.arrivals import ArrivalPredictor, ExpectedFrame
 from vergence_service.inference.batcher import StepBatcher
 from vergence_service.inference.model import Step, StepResult
 
 STEP_S = 0.08
-LIVE, OTHER = 200, 10  # brightness, by which the model tells them apart
+LIVE, OTHER = 200, 10  # brightness, by which the test distinguishes steps
 
 
 class TimedModel(RecallModel):
-    """Every step takes as long, by the clock of the test; the order of steps is kept."""
+    """A model whose steps all take STEP_S by the test's clock. It records their order."""
 
     def __init__(self, clock: ManualClock) -> None:
         super().__init__()
@@ -55,31 +56,29 @@ async def test_a_step_that_would_be_in_the_way_of_a_live_frame_waits_for_it() ->
             clock.advance(0.1 - STEP_S)
         clock.advance(-0.01)
         other = asyncio.create_task(batcher.step(make_step(OTHER + 1)))
-        await asyncio.sleep(0.02)
-        assert not other.done()
+        await turns()  # the batcher sees it, alone in the queue
         clock.advance(0.01)
         await live(batcher)
         clock.advance(3.0)  # the live stream has ended
-        await asyncio.wait_for(other, 5.0)
+        await asyncio.wait_for(other, PATIENCE_S)
     assert model.stepped == [OTHER, LIVE, LIVE, LIVE, LIVE, OTHER + 1]
 
 
 async def test_a_free_lane_is_not_for_others_while_a_live_step_is_in_the_model() -> None:
-    model = RecallModel(lanes=2)
-    async with make_batcher(model) as batcher:
+    clock, model = ManualClock(), RecallModel(max_concurrent_steps=2)
+    async with make_batcher(model, clock=clock) as batcher:
         with model.busy():
             urgent = asyncio.create_task(live(batcher))
             await asyncio.to_thread(model.wait_until_entered)
             other = asyncio.create_task(batcher.step(make_step(OTHER)))
-            await asyncio.sleep(0.02)
-            assert model.batches == [1]
-            model.batches.clear()
-        await asyncio.wait_for(asyncio.gather(urgent, other), 1.0)
-    assert model.batches == [1]
+            await turns()  # a step that may start has started by now
+            clock.advance(0.5)
+        await asyncio.wait_for(asyncio.gather(urgent, other), PATIENCE_S)
+    assert other.result()[1].queue_s == 0.5
 
 
 async def test_a_live_step_takes_the_free_lane_beside_another() -> None:
-    model = RecallModel(lanes=2)
+    model = RecallModel(max_concurrent_steps=2)
     async with make_batcher(model) as batcher:
         with model.busy():
             other = asyncio.create_task(batcher.step(make_step(OTHER)))
@@ -97,7 +96,8 @@ async def test_a_step_that_fits_into_the_gap_is_taken_at_once() -> None:
             await live(batcher)
             clock.advance(0.5 - STEP_S)
         await live(batcher)
-        await asyncio.wait_for(batcher.step(make_step(OTHER)), 0.2)
+        _, timings = await asyncio.wait_for(batcher.step(make_step(OTHER)), PATIENCE_S)
+    assert timings.queue_s == 0
 
 
 async def test_no_step_waits_for_ever() -> None:
@@ -117,16 +117,18 @@ async def test_no_step_waits_for_ever() -> None:
     assert 20 < taken < 35, "expected it after two seconds of live steps"
 
 
-def test_a_rhythm_is_learned_and_forgotten() -> None:
-    rhythm = LiveRhythm()
-    rhythm.arrived("a", 1.0)
-    assert rhythm.next_due(1.0) is None
-    rhythm.arrived("a", 1.5)
-    assert rhythm.next_due(1.5) == Due(2.0, 2.25)
-    rhythm.arrived("b", 1.5)
-    rhythm.arrived("b", 1.6)
-    assert rhythm.next_due(1.6) == Due(1.6 + (1.6 - 1.5), 1.6 + 1.5 * (1.6 - 1.5))
-    assert rhythm.next_due(1.9) == Due(2.0, 2.25), "b has stopped"
-    assert rhythm.next_due(2.3) is None, "both have"
-    rhythm.answered("a", 2.4)
-    assert rhythm.next_due(2.4) == Due(2.0, 2.65), "a was kept waiting and could not send"
+def test_a_cadence_is_learned_and_forgotten() -> None:
+    predictor = ArrivalPredictor()
+    predictor.arrived("a", 1.0)
+    assert predictor.next_expected(1.0) is None
+    predictor.arrived("a", 1.5)
+    assert predictor.next_expected(1.5) == ExpectedFrame(2.0, 2.25)
+    predictor.arrived("b", 1.5)
+    predictor.arrived("b", 1.6)
+    assert predictor.next_expected(1.6) == ExpectedFrame(1.6 + (1.6 - 1.5), 1.6 + 1.5 * (1.6 - 1.5))
+    assert predictor.next_expected(1.9) == ExpectedFrame(2.0, 2.25), "b has stopped"
+    assert predictor.next_expected(2.3) is None, "both have"
+    predictor.answered("a", 2.4)
+    assert predictor.next_expected(2.4) == ExpectedFrame(2.0, 2.65), (
+        "a was kept waiting and could not send"
+    )

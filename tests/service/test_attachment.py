@@ -1,4 +1,4 @@
-"""Who has a stream: losing the connection is not losing the state, and the newest one wins."""
+"""A stream keeps its state when its connection is lost, and the newest connection wins."""
 
 import asyncio
 from dataclasses import replace
@@ -8,6 +8,7 @@ import pytest
 
 from tests.support.frames import RIG, frame_message, make_frame, open_message
 from tests.support.models import RecallModel
+from tests.support.polling import eventually
 from tests.support.server import ManualClock, RawCall, connected, raw_stream, running_server
 from tests.support.status import reason_of
 from vergence_proto.types import StereoRig
@@ -17,13 +18,11 @@ from vergence_service.app.server import Running
 
 async def detached(server: Running, stream_id: str) -> None:
     """Wait until the server has noticed that the connection is gone."""
-    async with asyncio.timeout(10):
-        while server.engine.streams.get(stream_id).attachment is not None:  # noqa: ASYNC110
-            await asyncio.sleep(0.005)
+    await eventually(lambda: server.engine.streams.get(stream_id).attachment is None)
 
 
 async def reference_map() -> bytes:
-    """Frame 2 of a stream that nothing happened to."""
+    """The answer to frame 2 of an undisturbed stream."""
     async with running_server(RecallModel()) as server, raw_stream(server) as call:
         await call.ask(frame_message(make_frame(1)))
         return (await call.ask(frame_message(make_frame(2)))).disparity.disparity.data

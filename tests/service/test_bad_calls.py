@@ -61,7 +61,7 @@ async def test_bytes_that_are_no_message_end_the_call_and_keep_the_stream(opened
 
 async def test_a_message_far_over_the_limit_ends_the_call_and_keeps_the_stream() -> None:
     async with (
-        running_server(RecallModel(), grpc__max_frame_mib=1) as server,
+        running_server(RecallModel(), limits__max_frame_mib=1) as server,
         raw_stream(server, "mine") as call,
         connected(server) as stub,
     ):

@@ -88,7 +88,7 @@ def too_large(frame: pb.Frame) -> None:
         pytest.param(long_quaternion, "BAD_POSE", "unit", id="non-unit-quaternion"),
         pytest.param(out_of_order, "FRAME_OUT_OF_ORDER", "above 1", id="out-of-order"),
         pytest.param(too_large, "FRAME_TOO_LARGE", "1048576", id="too-large"),
-        pytest.param(first_pixel(RAISES), "MODEL_FAILED", "as it was", id="model-raises"),
+        pytest.param(first_pixel(RAISES), "MODEL_FAILED", "unchanged", id="model-raises"),
         pytest.param(first_pixel(NOT_FINITE), "NON_FINITE", "finite", id="not-finite"),
     ],
 )
@@ -99,7 +99,7 @@ async def test_a_bad_frame_is_answered_in_band_and_harms_nobody(
         return (await call.ask(frame_message(make_frame(frame_id)))).disparity
 
     async with (
-        running_server(RecallModel(), grpc__max_frame_mib=1) as server,
+        running_server(RecallModel(), limits__max_frame_mib=1) as server,
         raw_stream(server, "hit") as hit,
         raw_stream(server, "neighbour") as neighbour,
     ):

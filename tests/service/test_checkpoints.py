@@ -1,6 +1,7 @@
-"""What a sequence goes on from: exact where it is whole, and done again where it is not."""
+"""A sequence continues from its checkpoint, to the bit, or starts again if it is damaged."""
 
 import asyncio
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,26 +12,27 @@ from numpy.typing import NDArray
 
 from tests.support.frames import RIG, make_frame
 from tests.support.models import RecallModel
-from tests.support.polling import eventually
+from tests.support.polling import eventually, turns
 from tests.support.sequences import make_frames, write_sequence
 from tests.support.server import running_server
 from vergence_proto.accuracy import Accuracy
-from vergence_service.inference.model import Step, StepResult, View
+from vergence_service.inference.model import Step, StepResult, StereoView
 from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
 from vergence_service.inference.snapshots import BadSnapshot, state_from_bytes, state_to_bytes
 from vergence_service.jobs.checkpoints import read_checkpoint, write_checkpoint
 from vergence_service.jobs.job import Job, JobOptions
+from vergence_service.jobs.progress import JobProgress
 from vergence_service.jobs.results import read_frames
-from vergence_service.jobs.run import Progress, run_job
+from vergence_service.jobs.run import run_job
 
 FRAMES = 24
 
 
-def view_of(frame_id: int, *, posed: bool = True) -> View:
+def make_view(frame_id: int, *, posed: bool = True) -> StereoView:
     frame = make_frame(frame_id, brightness=40 + frame_id)
     assert frame.pose is not None
     pose = frame.pose.world_from_left if posed else None
-    return View(frame.left, frame.right, RIG, frame.capture_ns, pose)
+    return StereoView(frame.left, frame.right, RIG, frame.capture_ns, pose)
 
 
 @pytest.fixture(scope="module")
@@ -41,10 +43,10 @@ def model() -> OnnxStereoModel:
 
 
 def test_a_step_on_a_state_that_was_bytes_is_the_same_to_the_bit(model: OnnxStereoModel) -> None:
-    [first] = model.step([Step(view_of(1), None, 1)])
-    [expected] = model.step([Step(view_of(2), first.state, 1)])
+    [first] = model.step([Step(make_view(1), None, 1)])
+    [expected] = model.step([Step(make_view(2), first.state, 1)])
     restored = state_from_bytes(state_to_bytes(first.state))
-    [result] = model.step([Step(view_of(2), restored, 1)])
+    [result] = model.step([Step(make_view(2), restored, 1)])
     np.testing.assert_array_equal(result.offset_px, expected.offset_px)
     for tensor, same in zip(result.state.tensors, expected.state.tensors, strict=True):
         np.testing.assert_array_equal(tensor, same)
@@ -53,12 +55,12 @@ def test_a_step_on_a_state_that_was_bytes_is_the_same_to_the_bit(model: OnnxSter
 
 
 def test_a_state_without_a_pose_comes_back_without_one() -> None:
-    [result] = RecallModel().step([Step(view_of(1, posed=False), None, 1)])
+    [result] = RecallModel().step([Step(make_view(1, posed=False), None, 1)])
     assert state_from_bytes(state_to_bytes(result.state)).world_from_left is None
 
 
 def test_bytes_that_are_no_state_are_refused() -> None:
-    [result] = RecallModel().step([Step(view_of(1), None, 1)])
+    [result] = RecallModel().step([Step(make_view(1), None, 1)])
     whole = state_to_bytes(result.state)
     flipped = bytearray(whole)
     flipped[len(whole) // 2] ^= 1
@@ -68,7 +70,7 @@ def test_bytes_that_are_no_state_are_refused() -> None:
 
 
 class StopsAfter(RecallModel):
-    """Takes so many steps, and stays in the next one until it is let go."""
+    """A model that takes so many steps, and stays in the next until ``let_go``."""
 
     def __init__(self, count: int) -> None:
         super().__init__()
@@ -80,28 +82,28 @@ class StopsAfter(RecallModel):
         return super().step(steps)
 
 
-def make_job(folder: Path, *, metrics: bool = False) -> Job:
-    write_sequence(folder / "input", make_frames(FRAMES))
+def make_job(folder: Path, *, metrics: bool = False, frames: int = FRAMES) -> Job:
+    write_sequence(folder / "input", make_frames(frames))
     options = JobOptions(metrics=metrics)
     return Job(
         job_id="j",
         source="vergence:",
-        frames=FRAMES,
+        frames=frames,
         source_fps=30.0,
         created_s=0.0,
         options=options,
     )
 
 
-async def run(model: RecallModel, folder: Path, job: Job) -> tuple[Progress, Accuracy | None]:
-    progress = Progress()
+async def run(model: RecallModel, folder: Path, job: Job) -> tuple[JobProgress, Accuracy | None]:
+    progress = JobProgress()
     async with running_server(model) as server:
         found = await run_job(server.engine, folder, job, progress, checkpoint_s=1e-9)
     return progress, found
 
 
 async def run_to_the_middle(folder: Path, job: Job) -> None:
-    model, progress = StopsAfter(FRAMES // 2), Progress()
+    model, progress = StopsAfter(FRAMES // 2), JobProgress()
     async with running_server(model) as server:
         work = asyncio.create_task(run_job(server.engine, folder, job, progress, checkpoint_s=1e-9))
         # Not before the model has stopped: nobody would let it go.
@@ -117,7 +119,7 @@ def maps_in(folder: Path) -> list[NDArray[np.float32]]:
     return [frame.offset_px for frame in read_frames(folder / "result")]
 
 
-async def test_a_sequence_goes_on_from_its_checkpoint_to_the_bit(tmp_path: Path) -> None:
+async def test_a_sequence_continues_from_its_checkpoint_to_the_bit(tmp_path: Path) -> None:
     job = make_job(tmp_path / "halved", metrics=True)
     await run_to_the_middle(tmp_path / "halved", job)
     checkpoint = read_checkpoint(tmp_path / "halved" / "checkpoint")
@@ -152,7 +154,7 @@ def with_a_result_lost(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("spoil", [truncated, of_other_weights, with_a_result_lost])
-async def test_what_cannot_be_gone_on_from_is_done_again(
+async def test_a_sequence_without_a_usable_checkpoint_is_done_again(
     tmp_path: Path, spoil: Callable[[Path], None]
 ) -> None:
     job = make_job(tmp_path)
@@ -162,3 +164,31 @@ async def test_what_cannot_be_gone_on_from_is_done_again(
     progress, _ = await run(model, tmp_path, job)
     assert progress.frames_found == 0
     assert len(model.batches) == len(maps_in(tmp_path)) == FRAMES
+
+
+async def test_no_file_is_written_after_a_run_was_cancelled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    let_go = threading.Event()
+    writing: list[int] = []
+    written: list[int] = []
+
+    def write_slowly(folder: Path, index: int, disparity: object) -> None:
+        writing.append(index)
+        assert let_go.wait(timeout=30)
+        written.append(index)
+
+    monkeypatch.setattr("vergence_service.jobs.run.write_frame", write_slowly)
+    job = make_job(tmp_path, frames=1)
+    async with running_server(RecallModel()) as server:
+        run = asyncio.create_task(
+            run_job(server.engine, tmp_path, job, JobProgress(), checkpoint_s=1e-9)
+        )
+        await eventually(lambda: len(writing) == 1)
+        await turns()
+        run.cancel()
+        await turns()
+        assert not run.done(), "the run ended while a thread was writing"
+        let_go.set()
+        await asyncio.gather(run, return_exceptions=True)
+    assert written == [0]

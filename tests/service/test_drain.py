@@ -1,4 +1,4 @@
-"""Starting and ending: ready when warm, drained when told, one server a port."""
+"""The server is ready when the model is loaded, drains on a signal, and owns its port."""
 
 import asyncio
 import os

@@ -27,10 +27,10 @@ from vergence_service.inference.batcher import StepBatcher
 from vergence_service.metrics import Metrics
 from vergence_service.streams.continuity import ContinuityLimits
 from vergence_service.streams.engine import DepthEngine
-from vergence_service.streams.stream import Opening
+from vergence_service.streams.stream import StreamConfig
 from vergence_service.streams.table import StreamTable
 
-OPENING = Opening(StereoRig.from_rectified(RIG))
+OPENING = StreamConfig(StereoRig.from_rectified(RIG))
 
 
 async def step(engine: DepthEngine, stream_id: str, frame: StereoFrame) -> DisparityMap:
@@ -252,7 +252,7 @@ async def test_disparity_is_stated_relative_to_the_principal_points() -> None:
     shifted = replace(RIG, cx_left=RIG.cx_right + 4.25)
     async with running_server(RecallModel()) as server:
         await server.engine.open("plain", OPENING)
-        await server.engine.open("shifted", Opening(StereoRig.from_rectified(shifted)))
+        await server.engine.open("shifted", StreamConfig(StereoRig.from_rectified(shifted)))
         plain = await step(server.engine, "plain", make_frame(1))
         answer = await step(server.engine, "shifted", make_frame(1))
         offset_px = plain.disparity_px  # with equal principal points they are the same
@@ -269,7 +269,7 @@ async def test_disparity_is_stated_relative_to_the_principal_points() -> None:
 async def test_who_waits_for_every_frame_gets_a_first_one_with_more_iterations(
     delivery: Delivery, asked: int, cold: int
 ) -> None:
-    opening = Opening(StereoRig.from_rectified(RIG), delivery=delivery, cold_iterations=asked)
+    opening = StreamConfig(StereoRig.from_rectified(RIG), delivery=delivery, cold_iterations=asked)
     async with running_server(RecallModel(), model__cold_iterations=3) as server:
         await server.engine.open("a", opening)
         answers = [await step(server.engine, "a", make_frame(i)) for i in (1, 2)]

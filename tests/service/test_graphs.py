@@ -17,9 +17,9 @@ from tests.support.frames import make_frame
 from tests.support.weights_copy import WEIGHTS, Entry, copied_weights
 from vergence_proto.geometry import RectifiedRig
 from vergence_proto.model_io import ManifestError
-from vergence_service.inference.model import RecurrentState, Step, StepResult, View
+from vergence_service.inference.model import RecurrentState, Step, StepResult, StereoView
 from vergence_service.inference.onnx_model import OnnxStereoModel, on_host
-from vergence_service.inference.providers import Resident
+from vergence_service.inference.providers import DeviceTensor
 
 RIG = RectifiedRig(70, 40, 50.0, 50.0, 34.5, 34.5, 19.5, 0.1)
 WHITE = 255  # that the graphs fail on
@@ -42,16 +42,16 @@ def opened(
         yield model
 
 
-def make_view(frame_id: int) -> View:
+def make_view(frame_id: int) -> StereoView:
     frame = make_frame(frame_id, rig=RIG)
     assert frame.pose is not None
     shape = (2, RIG.height, RIG.width, 3)
     left, right = np.random.default_rng(frame_id).integers(0, WHITE, shape, np.uint8)
-    return View(left, right, RIG, frame.capture_ns, frame.pose.world_from_left)
+    return StereoView(left, right, RIG, frame.capture_ns, frame.pose.world_from_left)
 
 
 def walk(model: OnnxStereoModel, *, first: int = 1, frames: int = 4) -> list[StepResult]:
-    """A sequence that starts with two iterations and goes on with one."""
+    """A sequence that starts with two iterations and continues with one."""
     state: RecurrentState | None = None
     results = []
     for i in range(first, first + frames):
@@ -81,7 +81,9 @@ def test_stages_answer_bit_for_bit_what_the_whole_graph_answers(
     assert any((one.offset_px != expected[0].offset_px).any() for one in expected[1:])
     for one, other in zip(expected, found, strict=True):
         assert_same(one, other)
-        assert all(isinstance(each, Resident) == bool(states_on) for each in other.state.tensors)
+        assert all(
+            isinstance(each, DeviceTensor) == bool(states_on) for each in other.state.tensors
+        )
 
 
 @pytest.fixture(scope="module", params=[2, 3, 4], ids="{} threads".format)
@@ -100,7 +102,7 @@ def test_streams_that_step_at_once_get_bit_for_bit_what_each_gets_alone(
     laned: OnnxStereoModel, streams: list[tuple[int, int]]
 ) -> None:
     alone = [walk(laned, first=first, frames=frames) for first, frames in streams]
-    with ThreadPoolExecutor(laned.lanes) as threads:
+    with ThreadPoolExecutor(laned.max_concurrent_steps) as threads:
         walks = [
             threads.submit(walk, laned, first=first, frames=frames) for first, frames in streams
         ]
@@ -124,7 +126,7 @@ def test_there_are_lanes_for_as_many_graphs_as_run_side_by_side(
     name: str, threads: int, states_on: str | None, lanes: int
 ) -> None:
     with opened(name, threads=threads, states_on=states_on) as model:
-        assert model.lanes == lanes
+        assert model.max_concurrent_steps == lanes
 
 
 def test_a_stream_that_fails_does_not_disturb_the_one_beside_it() -> None:
@@ -195,7 +197,7 @@ def test_a_graph_that_several_counts_share_is_loaded_once(tmp_path: Path) -> Non
             assert_same(one, other)
 
 
-def whiten(view: View, *, left: bool, right: bool) -> View:
+def whiten(view: StereoView, *, left: bool, right: bool) -> StereoView:
     white = np.full_like(view.left, WHITE)
     return replace(view, left=white if left else view.left, right=white if right else view.right)
 
@@ -250,9 +252,9 @@ def a_stage_twice(graphs: Graphs) -> None:
     ("change", "says"),
     [
         (without_the_first_stage, "expected left_light, moved, sigma from a graph of an earlier"),
-        (without_the_last_stage, "no graph gives disparity, next_memory"),
+        (without_the_last_stage, "no graph computes disparity, next_memory"),
         (all_in_one_stage, "expected left_light, moved, sigma from a graph of an earlier"),
-        (a_stage_twice, "more than one graph gives left_light, moved"),
+        (a_stage_twice, "more than one graph computes left_light, moved"),
     ],
 )
 def test_graphs_that_do_not_fit_together_are_refused_when_they_are_loaded(

@@ -1,4 +1,4 @@
-"""What is uploaded may be anything: it is refused with a reason, and leaves nothing behind."""
+"""Hostile uploads are refused with a reason, and no files remain."""
 
 import io
 import json
@@ -198,8 +198,8 @@ async def test_hostile_uploads_are_refused_and_leave_nothing_behind(tmp_path: Pa
             answer = await client.post(
                 f"/v1/sequences{upload.query}", content=upload.body(), headers=dict(upload.headers)
             )
-            told = (answer.status_code, reason_of(answer))
-            assert told == (upload.status, upload.reason), (what, answer.text)
+            refusal = (answer.status_code, reason_of(answer))
+            assert refusal == (upload.status, upload.reason), (what, answer.text)
             assert upload.says in answer.text, (what, answer.text)
             assert str(tmp_path) not in answer.text, what
             assert not [*(tmp_path / "incoming").iterdir(), *(tmp_path / "jobs").iterdir()], what

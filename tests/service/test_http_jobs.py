@@ -20,6 +20,7 @@ from tests.support.http import (
     submit,
 )
 from tests.support.models import RAISES, RecallModel
+from tests.support.polling import eventually
 from tests.support.sequences import make_frames, sequence_files, zip_bytes
 from tests.support.server import raw_stream, running_server
 from vergence_proto.jobs import JobState
@@ -64,7 +65,7 @@ async def test_a_sequence_that_keeps_killing_the_server_is_given_up(tmp_path: Pa
 
 
 async def test_prometheus_hears_of_sequences() -> None:
-    async def told(client: httpx.AsyncClient) -> dict[str, float]:
+    async def metrics_of(client: httpx.AsyncClient) -> dict[str, float]:
         lines = (await client.get("/metrics")).text.splitlines()
         pairs = (line.rsplit(" ", 1) for line in lines if line.startswith("vergence_sequence"))
         return {name.removeprefix("vergence_"): float(value) for name, value in pairs}
@@ -74,12 +75,12 @@ async def test_prometheus_hears_of_sequences() -> None:
         with model.busy():
             jobs = [await submit(client, ARCHIVE) for _ in range(3)]
             await asyncio.to_thread(model.wait_until_entered)
-            waiting = await told(client)
+            waiting = await metrics_of(client)
         good = [await ended(client, job["id"]) for job in jobs]
         bad_frames = [*make_frames(2), make_frame(3, brightness=RAISES)]
         bad = await submit(client, zip_bytes(sequence_files(bad_frames)))
         assert (await ended(client, bad["id"]))["state"] == "failed"
-        after = await told(client)
+        after = await metrics_of(client)
     assert waiting['sequences{state="queued"}'] == 2
     assert waiting['sequences{state="running"}'] == 1
     assert waiting["sequence_disk_bytes"] > 0
@@ -95,9 +96,7 @@ async def test_results_expire_by_age(tmp_path: Path) -> None:
         await ended(client, job["id"])
         assert files_below(tmp_path / "jobs")
     async with http_server(RecallModel(), batch__directory=tmp_path, batch__keep_h=1e-9) as client:
-        async with asyncio.timeout(20):
-            while files_below(tmp_path / "jobs"):  # noqa: ASYNC110  the files are all that tells
-                await asyncio.sleep(0.01)
+        await eventually(lambda: not any((tmp_path / "jobs").iterdir()))
         assert (await client.get("/v1/sequences")).json() == []
 
 

@@ -1,4 +1,4 @@
-"""Whatever the schema allows, and whatever it does not, is answered as the schema says."""
+"""Every request, allowed by the schema or not, is answered as the schema says."""
 
 import asyncio
 import threading
@@ -31,7 +31,7 @@ Case = schemathesis.Case[Any]
 
 @pytest.fixture(scope="module")
 def api() -> Iterator[schemathesis.BaseSchema]:
-    """The schema as a running server tells it; the server runs in a thread with a loop."""
+    """The schema of a running server, which runs in a thread with its own loop."""
     address: list[str] = []
     started, stop = threading.Event(), threading.Event()
 

@@ -1,4 +1,4 @@
-"""Whole sequences over HTTP: what comes back is what a live stream of the same frames gets."""
+"""Whole sequences over HTTP give the same maps as a live stream of the same frames."""
 
 import asyncio
 import io
@@ -103,15 +103,15 @@ async def test_a_job_tells_how_far_it_is_and_ends_with_its_result() -> None:
             job = await submit(client, ARCHIVE)
             assert (job["frames"], job["source"]) == (6, "vergence:")
             async with client.stream("GET", f"/v1/sequences/{job['id']}/events") as events:
-                told = []
+                progress_seen = []
                 async for line in events.aiter_lines():
                     if line.startswith("data: "):
-                        told.append(json.loads(line.removeprefix("data: ")))
+                        progress_seen.append(json.loads(line.removeprefix("data: ")))
                         model.let_go()
         done = await ended(client, job["id"])
         listed = (await client.get("/v1/sequences")).json()
-    assert told[0]["state"] in ("queued", "running")
-    assert told[-1] == done
+    assert progress_seen[0]["state"] in ("queued", "running")
+    assert progress_seen[-1] == done
     assert (done["state"], done["frames_done"]) == ("done", 6)
     assert listed == [done]
 
@@ -153,7 +153,7 @@ def read_back(content: bytes, extension: str) -> Plane:
         return read_disparity_png(path) if extension == "png" else read_pfm(path)
 
 
-async def test_accuracy_is_told_where_the_archive_has_the_truth() -> None:
+async def test_accuracy_is_progress_seen_where_the_archive_has_the_truth() -> None:
     async with http_server(RecallModel()) as client:
         asked = await submit(client, ARCHIVE, metrics=True)
         unasked = await submit(client, ARCHIVE)

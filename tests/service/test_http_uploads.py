@@ -9,6 +9,7 @@ import pytest
 
 from tests.support.http import ended, http_server, http_to, reason_of, submit
 from tests.support.models import RecallModel
+from tests.support.polling import eventually
 from tests.support.sequences import (
     CALIBRATION,
     make_frames,
@@ -60,7 +61,7 @@ async def test_forms_are_refused_with_what_they_lack(tmp_path: Path) -> None:
             content=b'--b\r\nContent-Disposition: form-data; name="left"\r\n\r\nhalf',
             headers={"Content-Type": "multipart/form-data; boundary=b"},
         )
-        assert "cut short" in cut.text
+        assert "cut off" in cut.text
         assert not [*(tmp_path / "incoming").iterdir(), *(tmp_path / "jobs").iterdir()]
 
 
@@ -128,12 +129,8 @@ def is_empty(folder: Path) -> bool:
 
 
 async def holds_something(folder: Path) -> None:
-    async with asyncio.timeout(PATIENCE_S):
-        while is_empty(folder):  # noqa: ASYNC110  the server's files are all that tells
-            await asyncio.sleep(0.01)
+    await eventually(lambda: not is_empty(folder))
 
 
 async def emptied(folder: Path) -> None:
-    async with asyncio.timeout(PATIENCE_S):
-        while not is_empty(folder):  # noqa: ASYNC110
-            await asyncio.sleep(0.01)
+    await eventually(lambda: is_empty(folder))

@@ -37,7 +37,7 @@ async def test_a_full_server_says_when_to_come_back() -> None:
 
 async def test_a_client_that_has_its_share_is_told_so_and_leaves_room_to_others() -> None:
     async with (
-        running_server(RecallModel(), streams__per_client=1) as server,
+        running_server(RecallModel(), limits__streams_per_client=1) as server,
         raw_stream(server, "mine") as mine,
         connected(server) as stub,
     ):
@@ -47,7 +47,7 @@ async def test_a_client_that_has_its_share_is_told_so_and_leaves_room_to_others(
         assert 0 < seconds_to_wait(failure.value) <= 60
         # A share is an address's, by whatever door; to come back to what one has takes no other.
         async with DepthClient(f"http://{server.http_address}") as same:
-            with pytest.raises(Quota, match=r"127\.0\.0\.1 holds 1 streams"):
+            with pytest.raises(Quota, match=r"127\.0\.0\.1 has 1 open streams"):
                 async with same.open_session(RIG):
                     pass
         token = mine.opened.resume_token
@@ -65,7 +65,7 @@ async def test_a_client_that_has_its_share_is_told_so_and_leaves_room_to_others(
 async def test_states_take_no_more_memory_than_allowed() -> None:
     large = StereoRig.from_rectified(replace(RIG, width=512, height=400))  # 0.8 MB of state
     async with (
-        running_server(RecallModel(), streams__max_state_mib=1) as server,
+        running_server(RecallModel(), limits__max_state_mib=1) as server,
         raw_stream(server, rig=large),
         connected(server) as stub,
     ):

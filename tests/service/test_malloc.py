@@ -1,4 +1,4 @@
-"""What is freed is used again, and not faulted in anew for every frame."""
+"""Freed memory is used again and not faulted in for every frame."""
 
 import subprocess
 import sys

@@ -10,12 +10,18 @@ from tests.support.frames import make_frame
 from tests.support.weights_copy import WEIGHTS
 from vergence_proto.errors import NonFinite
 from vergence_proto.geometry import RectifiedRig
-from vergence_service.inference.model import RecurrentState, Step, StepResult, View, state_bytes
+from vergence_service.inference.model import (
+    RecurrentState,
+    Step,
+    StepResult,
+    StereoView,
+    state_bytes,
+)
 from vergence_service.inference.onnx_model import OnnxStereoModel, on_host, packaged_weights_dir
 from vergence_service.inference.providers import (
     PROVIDERS,
+    DeviceTensor,
     ProviderUnavailable,
-    Resident,
     require_provider,
 )
 from vergence_service.inference.snapshots import state_from_bytes, state_to_bytes
@@ -46,13 +52,13 @@ def model() -> OnnxStereoModel:
     return make_model(threads=2)
 
 
-def make_view(frame_id: int, seed: int, rig: RectifiedRig = RIG) -> View:
+def make_view(frame_id: int, seed: int, rig: RectifiedRig = RIG) -> StereoView:
     frame = make_frame(frame_id, brightness=seed, rig=rig)
     assert frame.pose is not None
     bright = np.random.default_rng(seed).integers(0, 255, (rig.height, rig.width, 1), np.uint8)
     left = np.repeat(bright, 3, axis=2)
     world_from_left = frame.pose.world_from_left
-    return View(left, np.roll(left, -7, axis=1), rig, frame.capture_ns, world_from_left)
+    return StereoView(left, np.roll(left, -7, axis=1), rig, frame.capture_ns, world_from_left)
 
 
 def walk(model: OnnxStereoModel, seed: int, *, frames: int) -> list[StepResult]:
@@ -112,7 +118,7 @@ def test_images_narrower_than_the_largest_disparity_are_served(
 ) -> None:
     view = make_view(1, 8)
     height, width = size
-    small = View(view.left[:height, :width], view.right[:height, :width], RIG, 1)
+    small = StereoView(view.left[:height, :width], view.right[:height, :width], RIG, 1)
     [result] = model.step([Step(small, None, 1)])
     assert result.offset_px.shape == size
 
@@ -124,7 +130,7 @@ def test_padding_is_the_edge_repeated(model: OnnxStereoModel) -> None:
     assert width > RIG.width
     around = ((0, height - RIG.height), (0, width - RIG.width), (0, 0))
     left, right = (np.pad(image, around, mode="edge") for image in (view.left, view.right))
-    padded = View(left, right, RIG, view.capture_ns, view.world_from_left)
+    padded = StereoView(left, right, RIG, view.capture_ns, view.world_from_left)
     [whole] = model.step([Step(padded, None, 1)])
     [cropped] = model.step([Step(view, None, 1)])
     expected = whole.offset_px[: RIG.height, : RIG.width]
@@ -135,12 +141,12 @@ def test_a_result_that_is_not_finite_is_not_passed_on() -> None:
     """The graph of the test weights divides by brightness."""
     model = make_model("reciprocal", weights=WEIGHTS)
     bright = np.full((8, 8, 3), 50, np.uint8)
-    [result] = model.step([Step(View(bright, bright, RIG, 1), None, 1)])
+    [result] = model.step([Step(StereoView(bright, bright, RIG, 1), None, 1)])
     np.testing.assert_allclose(result.offset_px, 1 / 150, rtol=1e-6)
     black = bright.copy()
     black[3, 4] = 0
     with pytest.raises(NonFinite):
-        model.step([Step(View(black, bright, RIG, 1), None, 1)])
+        model.step([Step(StereoView(black, bright, RIG, 1), None, 1)])
 
 
 def test_states_that_stay_on_their_device_change_no_result(model: OnnxStereoModel) -> None:
@@ -149,7 +155,7 @@ def test_states_that_stay_on_their_device_change_no_result(model: OnnxStereoMode
     for mine, plain in zip(walk(resident, 4, frames=3), walk(model, 4, frames=3), strict=True):
         np.testing.assert_array_equal(mine.offset_px, plain.offset_px)
         np.testing.assert_array_equal(mine.sigma_px, plain.sigma_px)
-        assert all(isinstance(tensor, Resident) for tensor in mine.state.tensors)
+        assert all(isinstance(tensor, DeviceTensor) for tensor in mine.state.tensors)
         assert mine.state.nbytes == plain.state.nbytes
         for tensor, same in zip(mine.state.tensors, plain.state.tensors, strict=True):
             np.testing.assert_array_equal(on_host(tensor), on_host(same))

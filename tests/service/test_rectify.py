@@ -14,7 +14,7 @@ from vergence_proto.errors import BadCalibration
 from vergence_proto.geometry import Pose
 from vergence_proto.types import Distortion, Intrinsics, PoseSample, StereoFrame, StereoRig
 from vergence_service.streams.rectify import Rectifier
-from vergence_service.streams.stream import Opening
+from vergence_service.streams.stream import StreamConfig
 
 WIDTH, HEIGHT = 320, 240
 # Toed in, rolled a little, and not quite level.
@@ -106,7 +106,7 @@ async def test_replies_state_the_rectified_rig_its_pose_and_nothing_unseen() -> 
     image = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
     frame = StereoFrame(1, 1, image, image, PoseSample(world_from_left))
     async with running_server(RecallModel()) as server:
-        await server.engine.open("a", Opening(rig))
+        await server.engine.open("a", StreamConfig(rig))
         answer = (await server.engine.step("a", lambda: frame, arrived_s=0.0)).disparity_map()
     assert answer.rig == rectifier.rig
     assert answer.world_from_left is not None

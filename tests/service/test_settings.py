@@ -1,5 +1,8 @@
-"""Where settings come from, and what is said about those that are not."""
+"""Settings come from flags, environment and file; an error names the key to use."""
 
+import re
+import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
@@ -11,12 +14,14 @@ def test_flags_win_over_the_environment_and_that_over_the_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = tmp_path / "vergence.toml"
-    config.write_text("[grpc]\nport = 1\ncredit = 7\nwaiting_frames = 5\n[model]\nthreads = 3\n")
+    config.write_text(
+        "[grpc]\nport = 1\n[streams]\ncredit = 7\nwaiting_frames = 5\n[model]\nthreads = 3\n"
+    )
     monkeypatch.setenv("VERGENCE_GRPC__PORT", "2")
-    monkeypatch.setenv("VERGENCE_GRPC__CREDIT", "4")
+    monkeypatch.setenv("VERGENCE_STREAMS__CREDIT", "4")
     settings = load_settings(config=config, flags={"grpc.port": 3})
-    grpc = settings.grpc
-    assert (grpc.port, grpc.credit, grpc.waiting_frames) == (3, 4, 5)
+    streams = settings.streams
+    assert (settings.grpc.port, streams.credit, streams.waiting_frames) == (3, 4, 5)
     assert (settings.model.threads, settings.http.port) == (3, 8000)
 
 
@@ -27,11 +32,45 @@ def test_what_is_printed_says_the_same_when_read(tmp_path: Path) -> None:
     assert load_settings(config=config).model_dump() == settings.model_dump()
 
 
-def test_every_key_is_printed() -> None:
-    text = Settings().to_toml()
-    for name, section in Settings().model_dump().items():
-        for key in section if isinstance(section, dict) else [name]:
-            assert f"{key} " in text
+def test_every_key_is_printed_in_its_table() -> None:
+    # A key without a value is printed as a comment, for TOML has no null.
+    text = re.sub(r"^# (\w+) is not set", r'\1 = "not set"', Settings().to_toml(), flags=re.M)
+    printed = tomllib.loads(text)
+    assert keys_per_table(printed) == keys_per_table(Settings().model_dump())
+
+
+def keys_per_table(values: Mapping[str, object]) -> dict[str, set[str]]:
+    tables = {"": {key for key, value in values.items() if not isinstance(value, dict)}}
+    tables |= {key: set(value) for key, value in values.items() if isinstance(value, dict)}
+    return tables
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("grpc.credit", "streams.credit"),
+        ("grpc.waiting_frames", "streams.waiting_frames"),
+        ("grpc.max_frame_mib", "limits.max_frame_mib"),
+        ("grpc.drain_s", "server.drain_s"),
+        ("streams.per_client", "limits.streams_per_client"),
+        ("streams.max_state_mib", "limits.max_state_mib"),
+        ("streams.max_pixels", "limits.max_pixels"),
+    ],
+)
+def test_a_moved_key_is_named_with_its_new_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, old: str, new: str
+) -> None:
+    table, _, key = new.partition(".")
+    assert key in Settings().model_dump()[table]
+    section, _, key = old.partition(".")
+    config = tmp_path / "vergence.toml"
+    config.write_text(f"[{section}]\n{key} = 5\n")
+    says = f"'{re.escape(old)}'.*now called '{re.escape(new)}'"
+    with pytest.raises(SettingsError, match=says):
+        load_settings(config=config)
+    monkeypatch.setenv(f"VERGENCE_{section}__{key}".upper(), "5")
+    with pytest.raises(SettingsError, match=says):
+        load_settings()
 
 
 def test_an_unknown_key_of_the_file_is_named_with_the_nearest_known(tmp_path: Path) -> None:

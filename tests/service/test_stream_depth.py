@@ -16,7 +16,7 @@ from vergence_proto import codec
 from vergence_proto.geometry import RectifiedRig
 from vergence_proto.types import StereoRig
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_service.inference.model import RecurrentState, Step, View
+from vergence_service.inference.model import RecurrentState, Step, StereoView
 from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
 
 END = pb.StreamDepthRequest(end=pb.End())
@@ -50,7 +50,9 @@ async def test_streamed_equals_the_model_run_offline() -> None:
     offline = []
     for frame in frames:
         assert frame.pose is not None
-        view = View(frame.left, frame.right, RIG, frame.capture_ns, frame.pose.world_from_left)
+        view = StereoView(
+            frame.left, frame.right, RIG, frame.capture_ns, frame.pose.world_from_left
+        )
         [result] = model.step([Step(view, state, 4 if state is None else 1)])
         state = result.state
         offline.append(result.offset_px)
@@ -89,7 +91,7 @@ async def test_the_newest_frame_wins_and_every_frame_is_answered_once() -> None:
             await asyncio.to_thread(model.wait_until_entered)
             for i in range(2, 9):
                 await call.send(frame_message(make_frame(i)))
-            # Each of them displaces the one before; when the last drop is told, 8 is waiting.
+            # Each of them displaces the one before; when the last drop is reported, 8 is waiting.
             dropped = [await call.receive() for _ in range(6)]
         await call.send(END)
         answers = [answer for answer in dropped if answer is not None]
@@ -104,7 +106,10 @@ async def test_the_newest_frame_wins_and_every_frame_is_answered_once() -> None:
 
 async def test_a_lossless_stream_makes_the_sender_wait_and_loses_nothing() -> None:
     model = RecallModel()
-    async with running_server(model, grpc__waiting_frames=2) as server, raw_stream(server) as call:
+    async with (
+        running_server(model, streams__waiting_frames=2) as server,
+        raw_stream(server) as call,
+    ):
 
         async def send_all() -> None:
             for i in range(1, 41):

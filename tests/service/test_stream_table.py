@@ -21,17 +21,17 @@ from vergence_proto.errors import (
 from vergence_proto.types import StereoRig
 from vergence_service.metrics import Metrics
 from vergence_service.streams.rectify import Rectifier
-from vergence_service.streams.stream import Notice, Opening, Stream
+from vergence_service.streams.stream import Notice, Stream, StreamConfig
 from vergence_service.streams.table import StreamTable
 
 CAPACITY, PER_CLIENT, MEMORY, STATE = 3, 2, 1000, 400
 IDLE_S, NOTICE_S, GRACE_S, TOMBSTONE_S = 60.0, 10.0, 10.0, 300.0
-RIG_OPENING = Opening(StereoRig.from_rectified(RIG))
+RIG_OPENING = StreamConfig(StereoRig.from_rectified(RIG))
 RECTIFIER = Rectifier.of(RIG_OPENING.rig)
 
 
 class Connection:
-    """Records what it is told."""
+    """An attachment that records its notices and its end."""
 
     def __init__(self) -> None:
         self.notices: list[Notice] = []

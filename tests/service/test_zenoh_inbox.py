@@ -1,4 +1,4 @@
-"""What waits between Zenoh's threads and the event loop, and what gives way."""
+"""The inbox between Zenoh's threads and the event loop: its order, its room, its drops."""
 
 from collections.abc import AsyncIterator
 
@@ -7,22 +7,22 @@ import pytest
 from vergence_proto.errors import Quota
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.zenoh.inbox import Inbox
-from vergence_proto.zenoh.session import ZenohPeer, make_config
+from vergence_proto.zenoh.session import ZenohSession, make_config
 
 KEY = "vergence/v1/s/frames"
 
 
 @pytest.fixture
-async def peer() -> AsyncIterator[ZenohPeer]:
+async def peer() -> AsyncIterator[ZenohSession]:
     """A session with itself: what it puts is received before the put returns."""
-    peer = ZenohPeer(make_config(max_message_bytes=1 << 20, mode="peer", listen__endpoints=[]))
+    peer = ZenohSession(make_config(max_message_bytes=1 << 20, mode="peer", listen__endpoints=[]))
     await peer.open()
     yield peer
     await peer.close()
 
 
-async def inbox_with(peer: ZenohPeer, *messages: pb.Frame | pb.Reset, live: bool) -> Inbox:
-    inbox = Inbox("mine", bulky=pb.Frame, room=1 if live else 2, displaces=live)
+async def inbox_with(peer: ZenohSession, *messages: pb.Frame | pb.Reset, live: bool) -> Inbox:
+    inbox = Inbox("mine", bulky=pb.Frame, max_bulky=1 if live else 2, drop_oldest=live)
     await peer.subscribe(KEY, inbox.put)
     for message in messages:
         await peer.put(KEY, message, attachment_id="mine")
@@ -30,7 +30,7 @@ async def inbox_with(peer: ZenohPeer, *messages: pb.Frame | pb.Reset, live: bool
 
 
 async def test_a_newer_frame_takes_the_place_of_one_and_a_reset_keeps_its_own(
-    peer: ZenohPeer,
+    peer: ZenohSession,
 ) -> None:
     frames = [pb.Frame(frame_id=frame_id) for frame_id in (1, 2, 3)]
     inbox = await inbox_with(peer, frames[0], pb.Reset(), *frames[1:], live=True)
@@ -39,7 +39,7 @@ async def test_a_newer_frame_takes_the_place_of_one_and_a_reset_keeps_its_own(
 
 
 async def test_a_lossless_sender_past_its_credit_is_ended_after_what_it_was_owed(
-    peer: ZenohPeer,
+    peer: ZenohSession,
 ) -> None:
     frames = [pb.Frame(frame_id=frame_id) for frame_id in (1, 2, 3)]
     inbox = await inbox_with(peer, *frames, live=False)
@@ -48,7 +48,7 @@ async def test_a_lossless_sender_past_its_credit_is_ended_after_what_it_was_owed
         await inbox.take()
 
 
-async def test_what_is_for_another_or_of_no_known_type_is_passed_over(peer: ZenohPeer) -> None:
+async def test_what_is_for_another_or_of_no_known_type_is_passed_over(peer: ZenohSession) -> None:
     inbox = await inbox_with(peer, live=False)
     await peer.put(KEY, pb.Frame(frame_id=1), attachment_id="another")
     await peer.put(KEY, pb.Vector3(x=1.0), attachment_id="mine")

@@ -1,4 +1,4 @@
-"""What the Zenoh network sees of a server: keys, encodings, answers to clients not of ours."""
+"""The server as seen from the Zenoh network: keys, encodings, answers to foreign clients."""
 
 import sys
 from collections.abc import AsyncIterator
@@ -20,8 +20,8 @@ from vergence import ConnectionLost, DepthClient
 from vergence_proto.errors import BadShape, UnknownStream
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.zenoh.inbox import Inbox
-from vergence_proto.zenoh.keys import ANY, StreamKeys, ask_key
-from vergence_proto.zenoh.session import Answer, ZenohPeer, make_config
+from vergence_proto.zenoh.keys import ANY, StreamKeys, query_key
+from vergence_proto.zenoh.session import QueryReply, ZenohSession, make_config
 from vergence_service.app.server import Running
 from vergence_service.transports.errors import ExtraMissing, ZenohUnreachable
 
@@ -30,15 +30,15 @@ KEYS = StreamKeys(NAMESPACE, "s")
 
 
 class Client:
-    """A client of its own making, message by message."""
+    """A client without the SDK, message by message."""
 
-    def __init__(self, peer: ZenohPeer) -> None:
+    def __init__(self, peer: ZenohSession) -> None:
         self.peer = peer
-        self.inbox = Inbox("mine", bulky=pb.DisparityMap, room=100, displaces=False)
+        self.inbox = Inbox("mine", bulky=pb.DisparityMap, max_bulky=100, drop_oldest=False)
 
-    async def ask(self, what: str, question: Message) -> Answer:
-        key = ask_key(NAMESPACE, ANY, what)
-        [answer] = await self.peer.ask(key, question, timeout_s=5, attachment_id="mine")
+    async def ask(self, what: str, question: Message) -> QueryReply:
+        key = query_key(NAMESPACE, ANY, what)
+        [answer] = await self.peer.query(key, question, timeout_s=5, attachment_id="mine")
         return answer
 
     async def open(self, *, every: bool) -> None:
@@ -62,7 +62,7 @@ async def served(model: RecallModel | None = None, **flags: Any) -> AsyncIterato
     async with running_server(
         model or RecallModel(), zenoh__enabled=True, zenoh__listen=[endpoint], **flags
     ):
-        peer = ZenohPeer(config)
+        peer = ZenohSession(config)
         await peer.open()
         try:
             yield Client(peer)
@@ -102,8 +102,8 @@ async def test_queries_are_answered_by_messages_and_refused_by_errors_of_ours() 
         verb = await client.ask("dance", pb.GetServerInfoRequest())
         opening = await client.ask("open", pb.OpenStream(stream_id="no rig"))
         garbage = await client.ask("open", BytesValue(value=b"\xff"))
-        key = ask_key(NAMESPACE, ANY, "open")
-        [nameless] = await client.peer.ask(key, open_message("s").open, timeout_s=5)
+        key = query_key(NAMESPACE, ANY, "open")
+        [nameless] = await client.peer.query(key, open_message("s").open, timeout_s=5)
     assert pb.GetServerInfoResponse.FromString(info.payload).model.name == "recall"
     assert isinstance(unknown.error, UnknownStream)
     assert isinstance(verb.error, BadShape)
@@ -151,13 +151,13 @@ async def test_what_an_earlier_attachment_left_on_the_way_is_passed_over() -> No
 
 async def test_a_lossless_client_that_breaks_its_credit_is_ended() -> None:
     model = RecallModel()
-    async with served(model, grpc__credit=2, grpc__waiting_frames=1) as client:
+    async with served(model, streams__credit=2, streams__waiting_frames=1) as client:
         await client.open(every=True)
         with model.busy():
             for frame_id in range(1, 41):
                 await client.send_frame(frame_id)
         answered = []
-        # A frame that the network lost is told of between the answers.
+        # A frame that the network lost is reported between the answers.
         while not isinstance(answer := await client.inbox.take(), status_pb2.Status):
             if isinstance(answer, pb.DisparityMap):
                 answered.append(answer.frame_id)
@@ -175,10 +175,10 @@ async def test_a_json5_file_says_where_to_listen(tmp_path: Path) -> None:
     )
     config = make_config(max_message_bytes=1 << 20, mode="client", connect__endpoints=[endpoint])
     async with running_server(RecallModel(), zenoh__enabled=True, zenoh__config=file):
-        peer = ZenohPeer(config)
+        peer = ZenohSession(config)
         await peer.open()
-        key = ask_key(NAMESPACE, ANY, "info")
-        assert len(await peer.ask(key, pb.GetServerInfoRequest(), timeout_s=5)) == 1
+        key = query_key(NAMESPACE, ANY, "info")
+        assert len(await peer.query(key, pb.GetServerInfoRequest(), timeout_s=5)) == 1
         await peer.close()
 
 

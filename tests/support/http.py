@@ -1,6 +1,5 @@
-"""HTTP to a server in this process, and what its answers hold."""
+"""HTTP clients of a server in this process, and readers of its answers."""
 
-import asyncio
 import io
 import zipfile
 from collections.abc import AsyncIterator
@@ -12,7 +11,9 @@ import httpx
 import numpy as np
 from numpy.typing import NDArray
 
+from tests.support.polling import eventually_true
 from tests.support.server import PATIENCE_S, running_server
+from vergence_proto.jobs import JobState
 from vergence_service.app.server import Running
 from vergence_service.inference.model import StereoModel
 
@@ -42,12 +43,14 @@ async def submit(client: httpx.AsyncClient, archive: bytes, **query: Any) -> dic
 
 async def ended(client: httpx.AsyncClient, job_id: str) -> dict[str, Any]:
     """The job once it is done or failed."""
-    async with asyncio.timeout(PATIENCE_S):
-        while True:
-            job: dict[str, Any] = (await client.get(f"/v1/sequences/{job_id}")).json()
-            if job["state"] in ("done", "failed"):
-                return job
-            await asyncio.sleep(0.02)
+    job: dict[str, Any] = {}
+
+    async def has_ended() -> bool:
+        job.update((await client.get(f"/v1/sequences/{job_id}")).json())
+        return JobState(job["state"]).ended
+
+    await eventually_true(has_ended)
+    return job
 
 
 async def disparities(client: httpx.AsyncClient, job_id: str) -> list[NDArray[np.float32]]:
@@ -57,14 +60,14 @@ async def disparities(client: httpx.AsyncClient, job_id: str) -> list[NDArray[np
 
 
 def disparities_in(archive: bytes) -> list[NDArray[np.float32]]:
-    """Of a result as a zip of npz, in order."""
+    """The maps in a result, a zip of npz files, in order."""
     with zipfile.ZipFile(io.BytesIO(archive)) as file:
         names = sorted(name for name in file.namelist() if name.endswith(".npz"))
         return [np.load(io.BytesIO(file.read(name)))["disparity"] for name in names]
 
 
 def reason_of(answer: httpx.Response) -> str:
-    """Of a refusal, which must be told as a problem."""
+    """The reason of a refusal, which must be problem details."""
     assert answer.headers["Content-Type"] == "application/problem+json", answer.text
     problem = answer.json()
     assert problem["status"] == answer.status_code

@@ -1,4 +1,4 @@
-"""A network small enough to know by heart: its memory, its failures and its pace are visible."""
+"""A tiny fake network: its memory, its failures and its pace are visible."""
 
 import threading
 import time
@@ -32,8 +32,8 @@ class RecallModel:
         weights_sha256="0" * 64,
     )
 
-    def __init__(self, *, lanes: int = 1) -> None:
-        self.lanes = lanes
+    def __init__(self, *, max_concurrent_steps: int = 1) -> None:
+        self.max_concurrent_steps = max_concurrent_steps
         self.batches: list[int] = []
         self._free = threading.Event()
         self._free.set()
@@ -51,7 +51,9 @@ class RecallModel:
             if row.view.left[0, 0, 0] == RAISES:
                 raise ArithmeticError("lens flare in /srv/secret.py")
             if row.view.left[0, 0, 0] == NOT_FINITE:
-                raise NonFinite("the network's result was not finite; the stream starts anew")
+                raise NonFinite(
+                    "the network's result was not finite; the stream starts again without a state"
+                )
         return [self._step_one(row) for row in steps]
 
     def _step_one(self, row: Step) -> StepResult:
@@ -81,7 +83,7 @@ class RecallModel:
 
 
 class PacedModel(RecallModel):
-    """Takes its time, so that others can see how far a sequence is."""
+    """A model whose steps take ``step_s``, so that tests can see the progress of a sequence."""
 
     def __init__(self, step_s: float) -> None:
         super().__init__()

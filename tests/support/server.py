@@ -75,7 +75,7 @@ class RawCall:
 @asynccontextmanager
 async def connected(server: Running) -> AsyncIterator[depth_pb2_grpc.DepthServiceStub]:
     async with grpc.aio.insecure_channel(server.grpc_address) as channel:
-        yield depth_pb2_grpc.DepthServiceStub(channel)  # type: ignore[no-untyped-call] # generated
+        yield depth_pb2_grpc.DepthServiceStub(channel)  # generated
 
 
 @asynccontextmanager

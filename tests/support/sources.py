@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tests.support import dataset_trees as trees
 from tests.support.strategies import assert_same_pose
-from vergence_proto.datasets import LayoutError, StereoSource, open_source
+from vergence_proto.datasets import DatasetError, StereoSource, open_source
 from vergence_proto.geometry import Pose, RectifiedRig
 
 TEXT_PRECISION = 1e-9  # poses were written with twelve digits
@@ -48,7 +48,7 @@ Change = Callable[[Path], object]
 
 def opening(spec: str) -> str:
     """What reading all of a source says is wrong."""
-    with pytest.raises(LayoutError) as caught:
+    with pytest.raises(DatasetError) as caught:
         list(open_source(spec))
     return str(caught.value)
 

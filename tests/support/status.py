@@ -1,4 +1,4 @@
-"""What a failed gRPC call says to programs."""
+"""The machine-readable details of a failed gRPC call."""
 
 import grpc
 from google.protobuf.message import Message

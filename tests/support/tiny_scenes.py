@@ -1,4 +1,4 @@
-"""Tiny scenes on film, and where their pixels go: for tests of the synthetic stereo video."""
+"""Tiny rendered scenes and the motion of their pixels, for tests of the synthetic video."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from vergence_models.data.clips import StereoClips
 from vergence_models.data.generator import GeneratorConfig
 from vergence_models.data.materials import Material
 from vergence_models.data.render import render
-from vergence_models.data.scenes import Builder, Light, Scene, turn_y
+from vergence_models.data.scenes import Builder, PointLight, Scene, turn_y
 from vergence_models.data.textures import TextureBank
 from vergence_models.data.views import Shot
 
@@ -20,7 +20,7 @@ FOCAL_PX, BASELINE_M = 100.0, 0.12
 
 def still_life(build: Builder, *, poses: np.ndarray | None = None) -> Shot:
     """Film what was built from the world's origin, by one lamp behind the camera."""
-    lamp = Light(np.array([0.3, -0.5, -1.0]), np.ones(3), 4.0)
+    lamp = PointLight(np.array([0.3, -0.5, -1.0]), np.ones(3), 4.0)
     scene = Scene(
         primitives=np.array(build.rows, np.float32),
         lights=(lamp, lamp),
@@ -49,7 +49,7 @@ PAINT = Material(texture=0, span_m=1.0)
 
 
 def reprojected(clips: StereoClips, index: int, frame: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Where the pixels of a frame lie in the next one: u, v and disparity there, each [H, W]."""
+    """The places of a frame's pixels in the next one: u, v and disparity there, each [H, W]."""
     fx, fy, cx, cy, baseline_m = (
         float(getattr(clips, name)[index]) for name in ("fx", "fy", "cx", "cy", "baseline_m")
     )

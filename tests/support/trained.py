@@ -1,4 +1,4 @@
-"""Networks as training might have left them, at no cost."""
+"""Networks with weights like those of trained ones, without training."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The ``vergence`` command. Needs the extra ``vergence[cli]``; the rest of the client does not."""
+"""The ``vergence`` command, which needs the extra ``vergence[cli]``; the SDK does not."""

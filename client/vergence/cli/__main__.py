@@ -1,4 +1,4 @@
-"""Where the ``vergence`` command starts, with or without what it needs."""
+"""Entry point of the ``vergence`` command; it reports a missing extra in one line."""
 
 import sys
 

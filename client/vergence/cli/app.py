@@ -12,21 +12,24 @@ from rich.console import Console
 from vergence.cli.batch import batch
 from vergence.cli.demo import bundled_sample, demo
 from vergence.cli.doctor import doctor
-from vergence.cli.errors import Trouble
+from vergence.cli.errors import CliError
 from vergence.cli.run import run
 from vergence.client import DEFAULT_SERVER, DepthClient
 from vergence_proto.errors import DepthError
 from vergence_proto.jobs import Output, ResultFormat
 
-app = typer.Typer(
+_HELP = {"help_option_names": ["-h", "--help"]}
+
+app: typer.Typer = typer.Typer(
     help="Live stereo depth over the network.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
+    context_settings=_HELP,
 )
 
-# What other installed packages contribute is loaded when it is called, and not before: a server's
-# imports would otherwise slow every command down, or break it where they are missing.
+# Commands of other installed packages are loaded when they are called: the imports of a server
+# would slow every command down, or break it if they are missing.
 _CONTRIBUTED = "vergence.commands"
 _ABOUT = {"serve": "Serve depth over gRPC, with health and metrics over HTTP."}
 
@@ -37,14 +40,14 @@ JsonOption = Annotated[
 
 
 def run_program() -> None:
-    """Run the command line; trouble is one line on stderr and the exit code."""
+    """Run the command line; an error is one line on stderr and the exit code."""
     try:
         app()
-    except (Trouble, DepthError, OSError) as trouble:  # OSError: a file that cannot be written
+    except (CliError, DepthError, OSError) as error:  # OSError: a file cannot be written
         Console(stderr=True, soft_wrap=True, highlight=False).print(
-            f"vergence: {trouble}", style="red", markup=False
+            f"vergence: {error}", style="red", markup=False
         )
-        raise SystemExit(getattr(trouble, "exit_code", 1)) from None
+        raise SystemExit(getattr(error, "exit_code", 1)) from None
 
 
 def _print_version(wanted: bool) -> None:
@@ -72,12 +75,14 @@ def _vergence(
 
 @app.command("demo")
 def _demo(
-    frames: Annotated[int | None, typer.Option(min=1, help="Stop after so many.")] = None,
-    source: Annotated[str | None, typer.Option(help="Another KIND:PATH than the sample.")] = None,
-    out: Annotated[Path, typer.Option(help="Where the pictures go.")] = Path("vergence-demo"),
+    frames: Annotated[int | None, typer.Option(min=1, help="Stop after so many frames.")] = None,
+    source: Annotated[
+        str | None, typer.Option(help="KIND:PATH of other data than the sample.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the pictures.")] = Path("vergence-demo"),
     json: JsonOption = None,
 ) -> None:
-    """Stream a sample through a server of its own, and show what comes of it."""
+    """Start a server, stream a sample through it, and draw the result."""
     text = source or bundled_sample()
     asyncio.run(demo(text, frames=frames, out=out, json=json, console=Console()))
 
@@ -88,27 +93,29 @@ def _run(
     server: Annotated[
         str | None,
         typer.Option(
-            help="HOST:PORT or zenoh://HOST:PORT of a running server; else one is started.",
+            help="HOST:PORT or zenoh://HOST:PORT of a running server; default: start one.",
             callback=_checked_server,
         ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Where disparity goes (default: vergence-run/NAME).")
+        Path | None, typer.Option(help="Folder for disparity (default: vergence-run/NAME).")
     ] = None,
     rate: Annotated[
         str,
-        typer.Option(help="max: every frame, losslessly. HZ or source: live, the newest win."),
+        typer.Option(help="max: every frame, losslessly. HZ or source: live, newest frames win."),
     ] = "max",
     iterations: Annotated[
-        int, typer.Option(min=0, help="Refinements a frame; 0: the server's default.")
+        int, typer.Option(min=0, help="Refinement iterations per frame; 0: the server's default.")
     ] = 0,
-    pictures: Annotated[bool, typer.Option("--pictures", help="Write a sheet to look at.")] = False,
+    pictures: Annotated[
+        bool, typer.Option("--pictures", help="Write a picture of some frames.")
+    ] = False,
     json: JsonOption = None,
 ) -> None:
     """Stream a sequence or a pair from disk and write its disparity.
 
-    Files are 16-bit PNG in KITTI's convention (x256, 0 = none): 0000.png, 0001.png, ... of a
-    sequence, disp.png of a pair.
+    The files are 16-bit PNG in KITTI's convention (x256, 0 = no value): 0000.png, 0001.png, ...
+    for a sequence, disp.png for a pair.
     """
     asyncio.run(
         run(
@@ -127,27 +134,29 @@ def _run(
 @app.command("batch")
 def _batch(
     paths: Annotated[
-        list[Path], typer.Argument(help="Archives, or folders in any layout that is read.")
+        list[Path], typer.Argument(help="Archives, or folders in a supported layout.")
     ],
     server: Annotated[
-        str | None, typer.Option(help="http://HOST:PORT of a running server; else one is started.")
+        str | None, typer.Option(help="http://HOST:PORT of a running server; default: start one.")
     ] = None,
-    out: Annotated[Path, typer.Option(help="Results go to OUT/NAME.")] = Path("vergence-batch"),
+    out: Annotated[Path, typer.Option(help="Folder for results: OUT/NAME.")] = Path(
+        "vergence-batch"
+    ),
     form: Annotated[
-        ResultFormat, typer.Option("--format", help="Of the results; mp4 is for looking at.")
+        ResultFormat, typer.Option("--format", help="File format of results; mp4 is for viewing.")
     ] = ResultFormat.PNG16,
     output: Annotated[
-        list[Output], typer.Option(help="Of every frame; may be given more than once.")
+        list[Output], typer.Option(help="Map to write for every frame; may be repeated.")
     ] = [Output.DISPARITY],  # noqa: B006  typer copies it
     iterations: Annotated[
-        int, typer.Option(min=0, help="Refinements a frame; 0: the server's default.")
+        int, typer.Option(min=0, help="Refinement iterations per frame; 0: the server's default.")
     ] = 0,
     metrics: Annotated[
-        bool, typer.Option("--metrics", help="Compare with the truth, where it is there.")
+        bool, typer.Option("--metrics", help="Compare with the ground truth, if there is any.")
     ] = False,
     json: JsonOption = None,
 ) -> None:
-    """Upload sequences, let the server work through them, and collect the results."""
+    """Upload sequences, wait for the server to process them, and download the results."""
     asyncio.run(
         batch(
             paths,
@@ -169,10 +178,12 @@ def _batch(
 def _doctor(
     server: Annotated[
         str,
-        typer.Option(help="HOST:PORT or zenoh://HOST:PORT to look for.", callback=_checked_server),
+        typer.Option(
+            help="HOST:PORT or zenoh://HOST:PORT of the server to test.", callback=_checked_server
+        ),
     ] = DEFAULT_SERVER,
 ) -> None:
-    """Tell what is installed, what is missing, and whether a server answers."""
+    """Report what is installed, what is missing, and whether a server answers."""
     if not asyncio.run(doctor(server, Console())):
         raise typer.Exit(1)
 
@@ -182,11 +193,13 @@ def _forwarding_to(entry: metadata.EntryPoint) -> Callable[[typer.Context], None
         try:
             command = entry.load()
         except ModuleNotFoundError as error:
-            raise Trouble(
+            raise CliError(
                 f"vergence {entry.name} needs {error.name}, which is not installed; "
                 "install it with: pip install 'vergence[server]'"
             ) from None
-        contributed = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+        contributed = typer.Typer(
+            add_completion=False, pretty_exceptions_enable=False, context_settings=_HELP
+        )
         contributed.command()(command)
         contributed(args=context.args, prog_name=f"vergence {entry.name}")
 

@@ -1,4 +1,4 @@
-"""``vergence batch``: many sequences up, their results down."""
+"""``vergence batch``: upload sequences, and download their results."""
 
 import asyncio
 import math
@@ -14,25 +14,26 @@ from rich.console import Console
 from rich.progress import Progress, TaskID
 from rich.table import Table
 
-from vergence.cli.errors import Trouble
+from vergence.cli.errors import CliError
+from vergence.cli.json_file import write_json
 from vergence.cli.local_server import local_server
-from vergence.cli.play import progress_bar, write_json
+from vergence.cli.progress import progress_bar
 from vergence.cli.sequence_jobs import Job, Query, SequenceService
 from vergence.cli.uploads import Upload, find_uploads
 from vergence_proto.errors import DepthError
 from vergence_proto.jobs import JobState
 
-# Packed and sent at once; the server runs them one after the other.
+# So many are packed and sent at once; the server runs them one after the other.
 _AT_ONCE = 3
 _CONNECT_S = 10.0
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of one upload."""
+    """The end of one upload: its job, and its error if it failed."""
 
     name: str
-    job: Job | None  # None: it was refused
+    job: Job | None  # None: the server refused the upload
     error: str | None = None
 
 
@@ -48,7 +49,7 @@ async def batch(
 ) -> None:
     """Upload every sequence at ``paths`` and write its result to OUT/NAME.
 
-    Raises Trouble: nothing to send, no server, or (at the end) some sequences failed.
+    Raises CliError: there is nothing to send, no server, or (at the end) some sequences failed.
     """
     uploads = find_uploads(list(paths))
     if server is None:
@@ -63,7 +64,7 @@ async def batch(
         write_json(json, _figures(outcomes, seconds))
     failed = [outcome for outcome in outcomes if outcome.error]
     if failed:
-        raise Trouble(f"{len(failed)} of {len(outcomes)} sequences failed; the table says why")
+        raise CliError(f"{len(failed)} of {len(outcomes)} sequences failed; the table says why")
 
 
 async def _send(
@@ -75,7 +76,7 @@ async def _send(
     console: Console,
 ) -> tuple[list[Outcome], float]:
     started_s = time.monotonic()
-    # Only connecting is bounded: an upload takes as long as it takes.
+    # Only connecting is bounded: the length of an upload is not known.
     timeout = httpx.Timeout(None, connect=_CONNECT_S)
     with progress_bar(console) as progress, tempfile.TemporaryDirectory() as scratch:
         async with httpx.AsyncClient(base_url=address, timeout=timeout) as http:
@@ -87,8 +88,8 @@ async def _send(
                     bar = progress.add_task(upload.name, total=None, note="uploading")
                     try:
                         job = await _run(service, upload, Path(scratch), query, progress, bar)
-                        if JobState(job["state"]) is JobState.FAILED:
-                            return Outcome(upload.name, job, f"{job['reason']}: {job['message']}")
+                        if job.state is JobState.FAILED:
+                            return Outcome(upload.name, job, f"{job.reason}: {job.message}")
                         await service.fetch(job, form, out / upload.name)
                         await service.forget(job)
                         return Outcome(upload.name, job)
@@ -115,15 +116,15 @@ async def _run(
     job = await service.submit(archive, {**query, **source})
     if archive != upload.path:
         archive.unlink()
-    async for job in service.watch(job):  # noqa: B020  the last one is what is wanted
-        ahead = f"{job['ahead']} before it" if job["ahead"] else job["state"]
-        note = f"{job['fps']:.1f} fps" if job["fps"] else ahead
-        progress.update(bar, completed=job["frames_done"], total=job["frames"], note=note)
+    async for job in service.watch(job):  # noqa: B020  the last one is returned
+        ahead = f"{job.ahead} before it" if job.ahead else job.state
+        note = f"{job.fps:.1f} fps" if job.fps else ahead
+        progress.update(bar, completed=job.frames_done, total=job.frames, note=note)
     return job
 
 
 def _frames(outcomes: Sequence[Outcome]) -> int:
-    return sum(each.job["frames"] for each in outcomes if each.job and not each.error)
+    return sum(each.job.frames for each in outcomes if each.job and not each.error)
 
 
 def _figures(outcomes: Sequence[Outcome], seconds: float) -> Mapping[str, Any]:
@@ -136,9 +137,9 @@ def _figures(outcomes: Sequence[Outcome], seconds: float) -> Mapping[str, Any]:
         "fps": frames / seconds,
         "results": {
             each.name: {
-                "frames": each.job["frames"] if each.job else 0,
-                "fps": each.job["fps"] if each.job else None,
-                "accuracy": each.job["accuracy"] if each.job else None,
+                "frames": each.job.frames if each.job else 0,
+                "fps": each.job.fps if each.job else None,
+                "accuracy": each.job.accuracy if each.job else None,
                 "error": each.error,
             }
             for each in outcomes
@@ -153,12 +154,12 @@ def _table(outcomes: Sequence[Outcome], seconds: float) -> Table:
         table.add_column(name, justify="right")
     table.add_column("")
     for each in outcomes:
-        job = each.job or {}
-        accuracy = job.get("accuracy") or {}
-        numbers = (job.get("fps"), accuracy.get("epe_px"), accuracy.get("d1_pct"))
+        job = each.job
+        accuracy = (job.accuracy if job else None) or {}
+        numbers = (job.fps if job else None, accuracy.get("epe_px"), accuracy.get("d1_pct"))
         table.add_row(
             each.name,
-            str(job.get("frames", "")),
+            str(job.frames) if job else "",
             *(f"{value:.2f}" if value and math.isfinite(value) else "" for value in numbers),
             each.error or "",
         )

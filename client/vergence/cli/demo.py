@@ -1,4 +1,4 @@
-"""``vergence demo``: the whole path on a bundled sequence, with a picture at the end."""
+"""``vergence demo``: stream the bundled sequence through a server and draw a picture."""
 
 import time
 from collections.abc import AsyncIterator, Sequence
@@ -8,20 +8,14 @@ from pathlib import Path
 
 from rich.console import Console
 
+from vergence.cli.captions import row_of, shown_in_sheet, title_of, write_sheet
+from vergence.cli.json_file import write_json
+from vergence.cli.local_server import server_for
 from vergence.cli.pictures import Row, Video
-from vergence.cli.play import (
-    accuracy_of,
-    progress_bar,
-    row_of,
-    server_for,
-    shown_in_sheet,
-    source_at,
-    title_of,
-    write_json,
-    write_sheet,
-)
+from vergence.cli.progress import progress_bar
 from vergence.cli.report import Report
-from vergence.cli.streaming import Answered, every_frame
+from vergence.cli.sources import source_at
+from vergence.cli.streaming import AnsweredFrame, every_frame
 from vergence.client import DepthClient
 from vergence_proto.datasets import SourceFrame, StereoSource
 from vergence_proto.types import Delivery
@@ -30,13 +24,14 @@ _FPS_UNKNOWN = 30.0
 
 
 def bundled_sample() -> str:
+    """Return the bundled sequence as ``KIND:PATH``."""
     return f"vergence:{resources.files('vergence') / 'sample' / 'room'}"
 
 
 async def demo(
     source_text: str, *, frames: int | None, out: Path, json: Path | None, console: Console
 ) -> None:
-    """Stream a source losslessly through a server of our own; show and save what came of it."""
+    """Stream a source losslessly through a server started here; show and save the results."""
     source = source_at(source_text)
     # Read before the clock starts: a camera does not decode files.
     filmed = list(source)[:frames]
@@ -47,7 +42,7 @@ async def demo(
         client.open_session(source.rig, delivery=Delivery.EVERY) as session,
     ):
         title = title_of(source, session.model.name)
-        answers: list[Answered] = []
+        answers: list[AnsweredFrame] = []
         with progress_bar(console) as progress:
             bar = progress.add_task("streaming", total=len(filmed), note="")
             started_s = time.monotonic()
@@ -57,7 +52,7 @@ async def demo(
                     progress.update(bar, advance=1, note=f"{1e3 * answered.latency_s:.0f} ms")
             report.seconds = time.monotonic() - started_s
     for answered in answers:
-        report.add(answered.latency_s, answered.result.timings.model_s, accuracy_of(answered))
+        report.add(answered.latency_s, answered.result.timings.model_s, answered.accuracy())
     _draw(source, title, [row_of(answered) for answered in answers], out, console)
     console.print(report.as_table(title))
     if json is not None:

@@ -1,4 +1,4 @@
-"""``vergence doctor``: what is here, what is missing, and what to do about it."""
+"""``vergence doctor``: report what is installed, what is missing, and how to install it."""
 
 import importlib.util
 import platform
@@ -19,7 +19,7 @@ from vergence_proto.errors import DepthError
 from vergence_proto.instruction_set import UNKNOWN, instruction_set
 from vergence_proto.model_io import ManifestError, load_model_card
 
-# What each extra adds; the base install is checked besides.
+# The packages of each extra; the empty name is the base install.
 _PACKAGES = {
     "": ("grpcio", "numpy", "opencv-python-headless", "protobuf"),
     "server": ("fastapi", "grpcio-health-checking", "onnxruntime", "prometheus-client", "uvicorn"),
@@ -31,20 +31,24 @@ _PORTS = {50051: "gRPC", 8000: "HTTP"}
 
 
 class Verdict(Enum):
+    """The mark in front of a finding."""
+
     GOOD = "[green]ok[/]"
-    NOTE = "[yellow]--[/]"  # not there, and not needed by everybody
+    NOTE = "[yellow]--[/]"  # missing, but not needed by everybody
     BAD = "[red]no[/]"
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
+    """One line of the report."""
+
     verdict: Verdict
     what: str
     detail: str
 
 
 async def doctor(server: str, console: Console) -> bool:
-    """Print all findings; False if something that everybody needs is wrong."""
+    """Print all findings; return False if a requirement of every command is not met."""
     findings = [_python(), _cpu(), *_packages(), *_ports(), _weights(), await _reachable(server)]
     table = Table(show_header=False, box=None)
     for finding in findings:
@@ -63,7 +67,7 @@ def _python() -> Finding:
 def _cpu() -> Finding:
     found = instruction_set()
     verdict = Verdict.NOTE if found == UNKNOWN else Verdict.GOOD
-    return Finding(verdict, "cpu", f"{found} (its best instruction set for int8)")
+    return Finding(verdict, "cpu", f"{found} (best instruction set for int8)")
 
 
 def _packages() -> Iterator[Finding]:
@@ -105,8 +109,8 @@ def _weights() -> Finding:
         card = load_model_card(directory, _DEFAULT_MODEL)
     except ManifestError as error:
         return Finding(Verdict.BAD, "weights", str(error))
-    told = f"{card.name} {card.weights_sha256[:12]}, as its manifest says"
-    return Finding(Verdict.GOOD, "weights", told)
+    summary = f"{card.name} {card.weights_sha256[:12]}, matches its manifest"
+    return Finding(Verdict.GOOD, "weights", summary)
 
 
 async def _reachable(server: str) -> Finding:

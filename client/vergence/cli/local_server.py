@@ -1,4 +1,4 @@
-"""A server of one's own, for as long as a command runs."""
+"""A server process that lives as long as a command."""
 
 import asyncio
 import importlib.util
@@ -10,7 +10,9 @@ from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager, suppress
 from typing import IO, Literal
 
-from vergence.cli.errors import Trouble
+from rich.console import Console
+
+from vergence.cli.errors import CliError
 
 _READY = re.compile(r"listening grpc=(\S+) http=(\S+)")
 _START_TIMEOUT_S = 60.0  # loading and warming a model up takes seconds on a small machine
@@ -23,16 +25,16 @@ async def local_server(
 ) -> AsyncIterator[str]:
     """Start ``python -m vergence_service`` on free ports; yields ``SCHEME://HOST:PORT``.
 
-    Raises Trouble: it is not installed, or does not come up; with its last words.
+    Raises CliError: the server is not installed or does not start; its last lines are quoted.
     """
     if importlib.util.find_spec("vergence_service") is None:
-        raise Trouble(
+        raise CliError(
             "the server is not installed here; install it with: pip install 'vergence[server]', "
             "or name a running one with --server HOST:PORT"
         )
     with (
         tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as log,
-        tempfile.TemporaryDirectory() as jobs,  # not the folder of a server that runs already
+        tempfile.TemporaryDirectory() as jobs,  # another server may use the default folder
     ):
         process = await asyncio.create_subprocess_exec(
             *(sys.executable, "-m", "vergence_service"),
@@ -48,6 +50,20 @@ async def local_server(
             await _stop(process)
 
 
+@asynccontextmanager
+async def server_for(server: str | None, console: Console) -> AsyncIterator[str]:
+    """Yield ``server``, or the address of a local server for the length of the block."""
+    if server is not None:
+        yield server
+        return
+    with console.status("starting a server") as status:
+        async with local_server() as address:
+            status.stop()
+            yield address
+            status.update("stopping the server")
+            status.start()
+
+
 async def _addresses(process: asyncio.subprocess.Process, log: IO[str]) -> dict[str, str]:
     assert process.stdout is not None
     try:
@@ -56,9 +72,9 @@ async def _addresses(process: asyncio.subprocess.Process, log: IO[str]) -> dict[
                 if ready := _READY.search(line.decode("utf-8", "replace")):
                     return {"grpc": ready[1], "http": ready[2]}
     except TimeoutError:
-        raise Trouble(_last_words(f"not ready within {_START_TIMEOUT_S:g} s", log)) from None
+        raise CliError(_last_words(f"not ready within {_START_TIMEOUT_S:g} s", log)) from None
     code = await process.wait()
-    raise Trouble(_last_words(f"exited with code {code}", log))
+    raise CliError(_last_words(f"exited with code {code}", log))
 
 
 def _last_words(what: str, log: IO[str]) -> str:
@@ -68,7 +84,7 @@ def _last_words(what: str, log: IO[str]) -> str:
 
 
 async def _stop(process: asyncio.subprocess.Process) -> None:
-    """Ask it to drain, and insist if it does not."""
+    """Ask the server to drain, and kill it if it does not end."""
     with suppress(ProcessLookupError):
         process.terminate()
     try:

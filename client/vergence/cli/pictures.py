@@ -1,6 +1,6 @@
-"""Disparity for the eye: panels with captions and colour scales, as sheets and as video.
+"""Pictures of disparity: panels with captions and colour scales, as sheets and as video.
 
-Images in are RGB and maps are pixels; every picture out is BGR uint8 [H, W, 3], as OpenCV writes.
+Input images are RGB, maps are in pixels. Pictures are BGR uint8 [H, W, 3], as OpenCV writes them.
 """
 
 from collections.abc import Sequence
@@ -28,14 +28,14 @@ _LARGEST_POINT_PX = 13
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """A colour map over [0, top] pixels; what is above takes the last colour."""
+    """A colour map over [0, top] pixels; larger values take the last colour."""
 
     name: str
     top_px: float
     colormap: int
 
     def paint(self, values: Map) -> Picture:
-        """Colour a map; where it has no value it is grey."""
+        """Colour a map; pixels without a value are grey."""
         share = np.nan_to_num(values / self.top_px, nan=0.0, posinf=1.0, neginf=0.0)
         levels = (np.clip(share, 0, 1) * 255).astype(np.uint8)
         colours = np.asarray(cv2.applyColorMap(levels, self.colormap), np.uint8)
@@ -43,7 +43,7 @@ class Scale:
         return colours
 
     def bar(self, width: int) -> Picture:
-        """The scale itself with its ticks, ``width`` pixels wide."""
+        """Draw the scale with its ticks, ``width`` pixels wide."""
         height, ramp_height = _BAR_HEIGHT, 12
         picture = _blank(height, width)
         ramp = np.linspace(0, self.top_px, width, dtype=np.float32)
@@ -59,7 +59,7 @@ class Scale:
 
 
 def disparity_scale(disparity_px: Map) -> Scale:
-    """A turbo scale that holds all but the nearest two per cent, its top a multiple of 16 px."""
+    """Make a turbo scale up to the 98th percentile, rounded up to a multiple of 16 px."""
     known = disparity_px[np.isfinite(disparity_px)]
     top_px = float(np.percentile(known, 98)) if known.size else 64.0
     return Scale("disparity", max(16.0, 16.0 * np.ceil(top_px / 16)), cv2.COLORMAP_TURBO)
@@ -70,7 +70,7 @@ ERROR_SCALE = Scale("error against truth", 4.0, cv2.COLORMAP_INFERNO)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Row:
-    """One frame of a sheet or a video: the view, what was made of it, and what is true."""
+    """One frame of a sheet or a video: the image, its disparity, and the ground truth."""
 
     caption: str
     left: NDArray[np.uint8]  # [H, W, 3], RGB
@@ -78,17 +78,18 @@ class Row:
     truth_px: Map | None = None
 
     def panels(self, scale: Scale) -> list[Picture]:
+        """Draw the image, the disparity, and the error if there is ground truth."""
         view = np.asarray(cv2.cvtColor(self.left, cv2.COLOR_RGB2BGR), np.uint8)
         panels = [view, scale.paint(self.disparity_px)]
         if self.truth_px is not None:
-            # A frame without an answer where there is truth is as wrong as the truth is large.
+            # A missing value counts as a disparity of zero.
             error_px = np.abs(np.nan_to_num(self.disparity_px, nan=0.0) - self.truth_px)
             panels.append(ERROR_SCALE.paint(_spread(error_px)))
         return panels
 
 
 def _spread(error_px: Map) -> Map:
-    """Enlarge the points of a sparse map until they can be seen: each to the gap between them."""
+    """Enlarge the points of a sparse map to the gap between them, so that they are visible."""
     known = np.isfinite(error_px)
     gap_px = min(round(1 / np.sqrt(max(known.mean(), 1e-6))), _LARGEST_POINT_PX)
     point = np.ones((gap_px, gap_px), np.uint8)
@@ -97,7 +98,7 @@ def _spread(error_px: Map) -> Map:
 
 
 def sheet(title: str, rows: Sequence[Row], *, panel_width: int = 480) -> Picture:
-    """All rows under each other with a title above and the colour scales below."""
+    """Draw all rows under each other, with a title above and the colour scales below."""
     scale = disparity_scale(rows[0].disparity_px if rows[0].truth_px is None else rows[0].truth_px)
     parts = [_heading(title, rows[0], panel_width)]
     parts += [_strip(row, scale, panel_width) for row in rows]
@@ -106,9 +107,9 @@ def sheet(title: str, rows: Sequence[Row], *, panel_width: int = 480) -> Picture
 
 
 class Video:
-    """An MP4 of rows, one a frame; use it inside ``with``.
+    """An MP4 with one row per frame; use it inside ``with``.
 
-    Raises OSError: this build of OpenCV cannot write the file.
+    Raises OSError: OpenCV cannot write the file.
     """
 
     def __init__(self, path: Path, first: Row, *, title: str, fps: float) -> None:
@@ -135,12 +136,13 @@ class Video:
         self._writer.release()
 
     def add(self, row: Row) -> None:
+        """Append a frame."""
         self._writer.write(self._compose(row))
 
     def _compose(self, row: Row) -> Picture:
         picture = np.vstack([self._heading, _strip(row, self._scale, 480), self._scales])
         height, width = picture.shape[:2]
-        return picture[: height - height % 2, : width - width % 2]  # video codecs want even sizes
+        return picture[: height - height % 2, : width - width % 2]  # video codecs need even sizes
 
 
 def _heading(title: str, row: Row, panel_width: int) -> Picture:
@@ -153,7 +155,7 @@ def _heading(title: str, row: Row, panel_width: int) -> Picture:
 
 
 def _strip(row: Row, scale: Scale, panel_width: int) -> Picture:
-    """The panels of one row side by side, with its caption below."""
+    """Draw the panels of one row side by side, with its caption below."""
     panels = row.panels(scale)
     height = round(panel_width * row.left.shape[0] / row.left.shape[1])
     picture = _blank(height + 30, _width(len(panels), panel_width))

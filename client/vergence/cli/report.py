@@ -1,4 +1,4 @@
-"""What a run amounts to: speed, and accuracy where the truth is known."""
+"""Figures of a run: speed, and accuracy if there is ground truth."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ from vergence_proto.accuracy import Accuracy
 
 @dataclass(slots=True)
 class Report:
-    """Filled while frames come back; ``seconds`` is the time from the first to the last of them."""
+    """Figures collected while frames come back; ``seconds`` is the duration of the run."""
 
     latencies_s: list[float] = field(default_factory=list)
     model_s: list[float] = field(default_factory=list)
@@ -28,12 +28,12 @@ class Report:
 
     @property
     def accuracy(self) -> Accuracy | None:
-        """The mean over the frames with truth; None if there are none."""
+        """The mean over the frames with ground truth; None if there are none."""
         mean = Accuracy.mean(self.accuracies)
         return mean if mean.n else None
 
     def as_json(self) -> Mapping[str, float | int | None]:
-        """The keys that other programs read; accuracy is null where no truth is known."""
+        """Return the keys that other programs read; accuracy is null without ground truth."""
         p50_ms, p95_ms = _percentiles_ms(self.latencies_s)
         mean = self.accuracy
         return {
@@ -60,11 +60,11 @@ class Report:
         table.add_column(style="dim")
         table.add_row("frames", str(len(self.latencies_s)), "answered")
         if self.drops.total:
-            table.add_row("dropped", str(self.drops.total), _told(self.drops))
+            table.add_row("dropped", str(self.drops.total), _by_place(self.drops))
         table.add_row("fps", f"{self.fps:.1f}", "end to end")
         table.add_row("latency p50", f"{p50_ms:.1f} ms", "from sending a frame to its depth")
         table.add_row("latency p95", f"{p95_ms:.1f} ms")
-        table.add_row("model p50", f"{model_ms:.1f} ms", "the network's share of it")
+        table.add_row("model p50", f"{model_ms:.1f} ms", "time of the network alone")
         if mean := self.accuracy:
             table.add_row("EPE", f"{mean.epe_px:.2f} px", "mean absolute error of disparity")
             table.add_row("D1", f"{mean.d1_pct:.1f} %", "pixels off by more than 1 px")
@@ -73,15 +73,15 @@ class Report:
 
 
 def _percentiles_ms(seconds: Sequence[float]) -> tuple[float, float]:
-    """The median, and what 95 % stay below."""
+    """Return the 50th and the 95th percentile in milliseconds."""
     if not seconds:
         return 0.0, 0.0
     p50_s, p95_s = np.percentile(seconds, (50, 95))
     return 1e3 * float(p50_s), 1e3 * float(p95_s)
 
 
-def _told(drops: Drops) -> str:
-    """Where frames were dropped, those places that had any."""
+def _by_place(drops: Drops) -> str:
+    """Name the places where frames were dropped, with their counts."""
     places = {
         "at the source": drops.at_source,
         "displaced in the server": drops.displaced,

@@ -1,36 +1,32 @@
-"""``vergence run``: a sequence or a pair from disk to disparity files, and to figures."""
+"""``vergence run``: stream a sequence or a pair from disk, write disparity and figures."""
 
 import asyncio
 import time
-from collections import deque
+from collections.abc import AsyncGenerator
 from contextlib import aclosing
 from pathlib import Path
 
 from rich.console import Console
+from rich.progress import TaskID
 
-from vergence.cli.errors import Trouble
+from vergence.cli.captions import row_of, shown_in_sheet, title_of, write_sheet
+from vergence.cli.errors import CliError
+from vergence.cli.json_file import write_json
+from vergence.cli.local_server import server_for
 from vergence.cli.pictures import Row
-from vergence.cli.play import (
-    accuracy_of,
-    progress_bar,
-    row_of,
-    server_for,
-    shown_in_sheet,
-    source_at,
-    title_of,
-    write_json,
-    write_sheet,
-)
+from vergence.cli.progress import progress_bar
 from vergence.cli.report import Report
-from vergence.cli.streaming import Answered, every_frame, live_frames
+from vergence.cli.sources import source_at
+from vergence.cli.streaming import AnsweredFrame, every_frame, live_frames
 from vergence.client import DepthClient
 from vergence.session import DepthSession
 from vergence_proto.accuracy import Accuracy
-from vergence_proto.datasets import LayoutError, StereoSource, read_ahead, write_disparity_png
+from vergence_proto.datasets import DatasetError, StereoSource, read_ahead, write_disparity_png
+from vergence_proto.ordered import in_order
 from vergence_proto.types import Delivery
 
-# Files being written while the next frames are stepped.
-_UNWRITTEN = 4
+# So many files may be in writing while the next frames are stepped.
+_WRITES_AT_ONCE = 4
 
 
 async def run(
@@ -44,7 +40,7 @@ async def run(
     json: Path | None,
     console: Console,
 ) -> None:
-    """Stream a source; write one disparity PNG per answered frame, and what else is asked for."""
+    """Stream a source; write one disparity PNG per answered frame, and pictures if requested."""
     source = source_at(source_text)
     rate_hz = _rate_hz(rate, source)
     directory = out or Path("vergence-run") / source.name
@@ -61,13 +57,13 @@ async def run(
         ) as session,
     ):
         title = title_of(source, session.model.name)
-        written = _Written(directory, alone=alone, kept=shown_in_sheet(len(source)))
+        results = _Results(directory, alone=alone, kept=shown_in_sheet(len(source)))
         try:
-            report = await _stream(session, source, rate_hz, written, console)
-        except LayoutError as error:  # a file in the middle of the sequence
-            raise Trouble(str(error), exit_code=2) from None
-    if pictures and written.rows:
-        write_sheet(directory / "sheet.png", title, written.rows)
+            report = await _stream(session, source, rate_hz, results, console)
+        except DatasetError as error:  # a file in the middle of the sequence
+            raise CliError(str(error), exit_code=2) from None
+    if pictures and results.rows:
+        write_sheet(directory / "sheet.png", title, results.rows)
         console.print(f"picture    {directory / 'sheet.png'}")
     console.print(f"disparity  {directory}")
     console.print(report.as_table(title))
@@ -76,13 +72,13 @@ async def run(
 
 
 def _rate_hz(rate: str, source: StereoSource) -> float | None:
-    """None: as quickly as the server answers, without a loss. Raises Trouble."""
+    """Parse ``--rate``; None means lossless, at the speed of the server. Raises CliError."""
     if rate == "max":
         return None
     if rate == "source":
         if source.fps is None:
-            raise Trouble(
-                f"{source.name} does not say at what rate it was filmed: give --rate HZ or max",
+            raise CliError(
+                f"{source.name} has no frame rate of its own: use --rate HZ or max",
                 exit_code=2,
             )
         return source.fps
@@ -91,12 +87,12 @@ def _rate_hz(rate: str, source: StereoSource) -> float | None:
     except ValueError:
         rate_hz = 0.0
     if not 0 < rate_hz < 10_000:
-        raise Trouble(f"--rate: expected a rate in Hz, source or max, got {rate!r}", exit_code=2)
+        raise CliError(f"--rate: expected a rate in Hz, source or max, got {rate!r}", exit_code=2)
     return rate_hz
 
 
-class _Written:
-    """Writes one file a frame, and keeps the rows of the sheet."""
+class _Results:
+    """Write one file per frame, and keep the rows of the sheet."""
 
     def __init__(self, directory: Path, *, alone: bool, kept: list[int]) -> None:
         self._directory = directory
@@ -104,13 +100,13 @@ class _Written:
         self._kept = kept
         self.rows: list[Row] = []
 
-    def write(self, answered: Answered) -> tuple[Answered, Accuracy | None]:
-        """Runs in a thread: compressing and comparing take longer than stepping."""
+    def write(self, answered: AnsweredFrame) -> tuple[AnsweredFrame, Accuracy | None]:
+        """Write and score a frame, in a thread: both may take longer than a step."""
         name = "disp.png" if self._alone else f"{answered.index:04d}.png"
         write_disparity_png(self._directory / name, answered.result.offset_px)
-        return answered, accuracy_of(answered)
+        return answered, answered.accuracy()
 
-    def keep(self, answered: Answered) -> None:
+    def keep_row(self, answered: AnsweredFrame) -> None:
         # Frames may have been dropped: the first one at or after each place is shown.
         if self._kept and answered.index >= self._kept[0]:
             self._kept = [index for index in self._kept if index > answered.index]
@@ -121,7 +117,7 @@ async def _stream(
     session: DepthSession,
     source: StereoSource,
     rate_hz: float | None,
-    written: _Written,
+    results: _Results,
     console: Console,
 ) -> Report:
     report = Report()
@@ -130,25 +126,26 @@ async def _stream(
         stream = every_frame(session, frames, in_flight=session.credit)
     else:
         stream = live_frames(session, frames, rate_hz=rate_hz)
-    writing: deque[asyncio.Task[tuple[Answered, Accuracy | None]]] = deque()
 
-    async def settle() -> None:
-        answered, found = await writing.popleft()
-        report.add(answered.latency_s, answered.result.timings.model_s, found)
-        written.keep(answered)
+    async def noted(bar: TaskID) -> AsyncGenerator[AnsweredFrame, None]:
+        async for answered in stream:
+            note = f"{1e3 * answered.latency_s:.0f} ms"
+            progress.update(bar, completed=answered.index + 1, note=note)
+            yield answered
+        report.seconds = time.monotonic() - started_s
+
+    async def write(answered: AnsweredFrame) -> tuple[AnsweredFrame, Accuracy | None]:
+        return await asyncio.to_thread(results.write, answered)
 
     with progress_bar(console) as progress:
         bar = progress.add_task("streaming", total=len(source), note="")
         started_s = time.monotonic()
-        async with aclosing(frames), aclosing(stream):
-            async for answered in stream:
-                if len(writing) == _UNWRITTEN:
-                    await settle()
-                writing.append(asyncio.create_task(asyncio.to_thread(written.write, answered)))
-                note = f"{1e3 * answered.latency_s:.0f} ms"
-                progress.update(bar, completed=answered.index + 1, note=note)
-        report.seconds = time.monotonic() - started_s
-        while writing:
-            await settle()
+        # A cancelled task cannot stop its thread, so writes that have begun are awaited.
+        noting = noted(bar)
+        writing = in_order(noting, write, limit=_WRITES_AT_ONCE, cancel_rest=False)
+        async with aclosing(frames), aclosing(stream), aclosing(noting), aclosing(writing):
+            async for answered, found in writing:
+                report.add(answered.latency_s, answered.result.timings.model_s, found)
+                results.keep_row(answered)
     report.drops = session.drops
     return report

@@ -1,4 +1,4 @@
-"""A server's /v1/sequences, from the other side: it may be busy, or gone for a while."""
+"""Client of a server's ``/v1/sequences``, which may be busy or unreachable for a while."""
 
 import asyncio
 import time
@@ -7,36 +7,68 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import httpx
 
-from vergence.cli.errors import Trouble
+from vergence.cli.errors import CliError
 from vergence_proto.errors import DepthError, error_from_wire
 from vergence_proto.jobs import JobState
 
-# A server that is restarted is back within this.
+# A server that restarts is expected to answer again within this time.
 _PATIENCE_S = 60.0
 _ASK_EVERY_S = 0.5
 _CHUNK = 1 << 20
 _UNAVAILABLE = {429, 503}
 
 Query = dict[str, str | int | bool | list[str]]
-Job = dict[str, Any]  # the JSON of SequenceJob
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """A sequence on the server, as ``/v1/sequences`` states it."""
+
+    id: str
+    state: JobState
+    frames: int
+    frames_done: int
+    ahead: int
+    """The number of jobs before this one."""
+    fps: float | None
+    accuracy: dict[str, float | None] | None
+    """EPE and error rates, if they were requested and the sequence has ground truth."""
+    reason: str | None
+    """The error code of a failed job."""
+    message: str | None
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> Self:
+        """Read the fields that the commands use; a newer server may send others."""
+        return cls(
+            id=values["id"],
+            state=JobState(values["state"]),
+            frames=values["frames"],
+            frames_done=values["frames_done"],
+            ahead=values["ahead"],
+            fps=values["fps"],
+            accuracy=values["accuracy"],
+            reason=values["reason"],
+            message=values["message"],
+        )
 
 
 @dataclass(frozen=True, slots=True)
 class SequenceService:
-    """Requests that are worth repeating are repeated; what is refused is raised.
+    """Requests to a server; each is repeated while the server is unreachable or has no room.
 
-    Raises the class of :mod:`vergence_proto.errors` that the server names, and Trouble where it
-    cannot be reached.
+    Every method raises the class of :mod:`vergence_proto.errors` that the server names, and
+    CliError if the server cannot be reached for a minute.
     """
 
     http: httpx.AsyncClient
 
     async def submit(self, archive: Path, query: Query) -> Job:
-        """Upload an archive, waiting for a place in the queue for as long as it takes."""
+        """Upload an archive, and wait for a place in the queue for as long as it takes."""
         size = (await asyncio.to_thread(archive.stat)).st_size
         headers = {"Content-Type": "application/octet-stream", "Content-Length": str(size)}
         while True:
@@ -48,24 +80,24 @@ class SequenceService:
             if answer.status_code not in _UNAVAILABLE or "Retry-After" not in answer.headers:
                 break
             await asyncio.sleep(float(answer.headers["Retry-After"]))
-        return _checked_json(answer)
+        return _checked_job(answer)
 
     async def watch(self, job: Job) -> AsyncIterator[Job]:
-        """The job, again and again, until it has ended."""
+        """Yield the job twice a second until it has ended."""
         while True:
             yield job
-            if JobState(job["state"]).ended:
+            if job.state.ended:
                 return
             await asyncio.sleep(_ASK_EVERY_S)
-            ask = partial(self.http.get, f"/v1/sequences/{job['id']}")
-            job = _checked_json(await self._patiently(ask))
+            ask = partial(self.http.get, f"/v1/sequences/{job.id}")
+            job = _checked_job(await self._patiently(ask))
 
     async def fetch(self, job: Job, form: str, target: Path) -> None:
-        """The result of a job: a folder of files, or a film."""
+        """Download the result of a job: a folder of files, or a film."""
         target.parent.mkdir(parents=True, exist_ok=True)
         film = form == "mp4"
         file = target.with_name(target.name + (".mp4" if film else ".zip.part"))
-        url = f"/v1/sequences/{job['id']}/result"
+        url = f"/v1/sequences/{job.id}/result"
 
         async def download() -> httpx.Response:
             async with self.http.stream("GET", url, params={"format": form}) as answer:
@@ -84,8 +116,8 @@ class SequenceService:
             await asyncio.to_thread(_unpack, file, target)
 
     async def forget(self, job: Job) -> None:
-        """Free the room that the job takes on the server."""
-        await self._patiently(lambda: self.http.delete(f"/v1/sequences/{job['id']}"))
+        """Delete the job and its files on the server."""
+        await self._patiently(lambda: self.http.delete(f"/v1/sequences/{job.id}"))
 
     async def _patiently(self, ask: Callable[[], Awaitable[httpx.Response]]) -> httpx.Response:
         since_s = time.monotonic()
@@ -94,7 +126,7 @@ class SequenceService:
                 return await ask()
             except httpx.TransportError as error:
                 if time.monotonic() - since_s > _PATIENCE_S:
-                    raise Trouble(f"cannot reach {self.http.base_url}: {error}") from None
+                    raise CliError(f"cannot reach {self.http.base_url}: {error}") from None
             await asyncio.sleep(_ASK_EVERY_S)
 
 
@@ -104,22 +136,21 @@ async def _chunks(path: Path) -> AsyncIterator[bytes]:
             yield chunk
 
 
-def _checked_json(answer: httpx.Response) -> Job:
+def _checked_job(answer: httpx.Response) -> Job:
     if answer.is_error:
         raise _error_of(answer)
-    job: Job = answer.json()
-    return job
+    return Job.from_json(answer.json())
 
 
-def _error_of(answer: httpx.Response) -> DepthError | Trouble:
+def _error_of(answer: httpx.Response) -> DepthError | CliError:
     if answer.headers.get("Content-Type") == "application/problem+json":
         problem = answer.json()
         if "reason" in problem:
             return error_from_wire(problem["reason"], problem["detail"])
-    return Trouble(f"{answer.url} answered {answer.status_code}: is it a Vergence server?")
+    return CliError(f"{answer.url} answered {answer.status_code}: is it a Vergence server?")
 
 
 def _unpack(archive: Path, folder: Path) -> None:
     with zipfile.ZipFile(archive) as file:
-        file.extractall(folder)  # our own server's; extractall keeps names below the folder
+        file.extractall(folder)  # extractall keeps all names below the folder
     archive.unlink()

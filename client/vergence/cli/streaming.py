@@ -1,57 +1,60 @@
-"""A source from disk through a session, frame by frame: losslessly, or live at a rate."""
+"""Streaming of a source from disk through a session: losslessly, or live at a rate."""
 
 import asyncio
 import time
-from collections import deque
 from collections.abc import AsyncGenerator, AsyncIterator
 from dataclasses import dataclass
 
 from vergence.results import DepthResult
 from vergence.session import DepthSession
+from vergence_proto.accuracy import Accuracy, accuracy
 from vergence_proto.datasets import SourceFrame
+from vergence_proto.ordered import in_order
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Answered:
-    """One frame of a source and what came of it."""
+class AnsweredFrame:
+    """One frame of a source and its result."""
 
-    index: int  # in the source, from 0
+    index: int
+    """The position of the frame in the source, from 0."""
     source: SourceFrame
+    """The frame, with its ground truth if the source has any."""
     result: DepthResult
-    latency_s: float  # from handing the frame over to having its result
+    """The result of the server."""
+    latency_s: float
+    """Seconds from handing the frame over to receiving its result."""
+
+    def accuracy(self) -> Accuracy | None:
+        """Compare with the ground truth; None if there is none."""
+        if self.source.truth_px is None:
+            return None
+        return accuracy(self.result.offset_px, self.source.truth_px, self.source.truth_mask)
 
 
-async def every_frame(
+def every_frame(
     session: DepthSession, frames: AsyncIterator[tuple[int, SourceFrame]], *, in_flight: int
-) -> AsyncGenerator[Answered, None]:
+) -> AsyncGenerator[AnsweredFrame, None]:
     """Step every frame, in order, with up to ``in_flight`` of them on the way.
 
-    With 1 a latency is that of a frame alone; with the session's credit the server never waits.
+    With 1 the latency is that of a frame alone; with the session's credit the server never waits.
     """
-    waiting: deque[asyncio.Task[Answered]] = deque()
-    try:
-        async for index, frame in frames:
-            if len(waiting) == in_flight:
-                yield await waiting.popleft()
-            waiting.append(asyncio.create_task(_step(session, index, frame)))
-        while waiting:
-            yield await waiting.popleft()
-    finally:
-        for task in waiting:
-            task.cancel()
-        await asyncio.gather(*waiting, return_exceptions=True)
 
+    async def step(indexed: tuple[int, SourceFrame]) -> AnsweredFrame:
+        index, source = indexed
+        frame = source.frame
+        started_s = time.monotonic()
+        result = await session.step(
+            frame.left, frame.right, frame.pose, capture_ns=frame.capture_ns
+        )
+        return AnsweredFrame(index, source, result, time.monotonic() - started_s)
 
-async def _step(session: DepthSession, index: int, source: SourceFrame) -> Answered:
-    frame = source.frame
-    started_s = time.monotonic()
-    result = await session.step(frame.left, frame.right, frame.pose, capture_ns=frame.capture_ns)
-    return Answered(index, source, result, time.monotonic() - started_s)
+    return in_order(frames, step, limit=in_flight)
 
 
 async def live_frames(
     session: DepthSession, frames: AsyncIterator[tuple[int, SourceFrame]], *, rate_hz: float
-) -> AsyncGenerator[Answered, None]:
+) -> AsyncGenerator[AnsweredFrame, None]:
     """Submit frames at a rate, as a camera would; the session counts those that are dropped."""
     sent: dict[int, tuple[int, SourceFrame]] = {}
 
@@ -71,8 +74,8 @@ async def live_frames(
         async for result in session:
             index, source = sent[result.frame_id]
             for frame_id in [older for older in sent if older <= result.frame_id]:
-                del sent[frame_id]  # answers come in order: these were dropped on the way
-            yield Answered(index, source, result, result.age_s)
+                del sent[frame_id]  # answers come in order: the older ones were dropped
+            yield AnsweredFrame(index, source, result, result.age_s)
         await camera
     finally:
         camera.cancel()

@@ -1,12 +1,12 @@
-"""What ``vergence batch`` sends: archives as they are, folders packed into one."""
+"""Uploads of ``vergence batch``: archives as they are, folders packed into archives."""
 
 import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from vergence.cli.errors import Trouble
-from vergence_proto.datasets import LAYOUTS, LayoutError, find_sources
+from vergence.cli.errors import CliError
+from vergence_proto.datasets import DATASETS, DatasetError, find_sources
 
 _ARCHIVES = (".zip", ".tar", ".tar.gz", ".tgz", ".tar.xz", ".txz", ".tar.bz2", ".tbz2")
 _OWN_LAYOUT = "vergence"
@@ -14,14 +14,14 @@ _OWN_LAYOUT = "vergence"
 
 @dataclass(frozen=True, slots=True)
 class Upload:
-    """One sequence and where it lies."""
+    """One sequence and its location."""
 
-    name: str  # of its results, unique in a batch
+    name: str  # the name of the results, unique in a batch
     path: Path  # an archive, or a folder to pack
-    source: str | None = None  # KIND:PATH in it, where the server cannot know
+    source: str | None = None  # KIND:PATH inside the archive; None: the server finds it
 
     def pack(self, scratch: Path) -> Path:
-        """The archive to send; images are compressed already, so it only gathers them."""
+        """Return the archive to send; it stores files, since images are compressed already."""
         if self.path.is_file():
             return self.path
         archive = scratch / f"{self.name}.zip"
@@ -33,9 +33,9 @@ class Upload:
 
 
 def find_uploads(paths: list[Path]) -> list[Upload]:
-    """Every sequence at ``paths``: an archive, a folder of one, or a folder of many of our own.
+    """Find the sequences at ``paths``: archives, folders of one, or of many in Vergence's layout.
 
-    Raises Trouble: a path that is neither, or that holds none.
+    Raises CliError: a path is neither, or contains no sequence.
     """
     taken: set[str] = set()
     return [
@@ -50,7 +50,7 @@ def _at(path: Path) -> Iterator[Upload]:
         yield Upload(path.name.partition(".")[0], path)
         return
     if not path.is_dir():
-        raise Trouble(
+        raise CliError(
             f"{path}: expected a folder, or an archive ({' '.join(_ARCHIVES)})", exit_code=2
         )
     own = _found(_OWN_LAYOUT, path)
@@ -58,12 +58,12 @@ def _at(path: Path) -> Iterator[Upload]:
         for folder in own:
             yield Upload(folder.name or path.resolve().name, folder)
         return
-    others = [(kind, each) for kind in LAYOUTS for each in _found(kind, path)]
+    others = [(kind, each) for kind in DATASETS for each in _found(kind, path)]
     if not others:
-        raise Trouble(f"{path}: no sequence in {', '.join(LAYOUTS)} layout", exit_code=2)
+        raise CliError(f"{path}: no sequence in {', '.join(DATASETS)} layout", exit_code=2)
     if len(others) > 1:
         named = ", ".join(f"{kind}:{each}" for kind, each in others[:8])
-        raise Trouble(
+        raise CliError(
             f"{path}: more than one sequence ({named}); name folders that hold one", exit_code=2
         )
     kind, folder = others[0]
@@ -73,8 +73,8 @@ def _at(path: Path) -> Iterator[Upload]:
 def _found(kind: str, path: Path) -> list[Path]:
     try:
         specs = find_sources(f"{kind}:{path}")
-    except LayoutError as error:
-        raise Trouble(str(error), exit_code=2) from None
+    except DatasetError as error:
+        raise CliError(str(error), exit_code=2) from None
     return [Path(spec.partition(":")[2]) for spec in specs]
 
 

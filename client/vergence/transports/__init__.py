@@ -1,1 +1,1 @@
-"""How messages reach a server. A transport translates, and nothing else."""
+"""Transports to a server: gRPC, HTTP and Zenoh. A transport translates and does nothing else."""

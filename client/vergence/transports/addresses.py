@@ -1,4 +1,4 @@
-"""From the address of a server to what makes the transport to it."""
+"""Parsing of server addresses, and the choice of a transport."""
 
 import ipaddress
 from collections.abc import Callable
@@ -17,9 +17,9 @@ _EXPECTED = (
 
 
 def connector(server: str) -> Callable[[], Transport]:
-    """What makes the transport to ``server``, to be called in the event loop it will live in.
+    """Return a function that makes the transport; call it in the event loop that will use it.
 
-    ``zenoh+tls://`` and the like name the link, which is TCP otherwise. Raises ValueError.
+    ``zenoh+tls://`` and the like name the link, which is TCP by default. Raises ValueError.
     """
     scheme, separator, address = server.rpartition("://")
     if scheme == ("grpc" if separator else "") and _is_place(address):
@@ -33,9 +33,9 @@ def connector(server: str) -> Callable[[], Transport]:
 
 
 def on_this_machine(server: str) -> bool:
-    """Whether bytes to and from ``server`` cost no network: it is named by a loopback address.
+    """Return True if ``server`` is a loopback address, so that bytes cost no network.
 
-    A Zenoh address is that of a router, and says nothing about where the server is.
+    A Zenoh address is that of a router; the server may be elsewhere.
     """
     scheme, _, address = server.rpartition("://")
     host = urlsplit(f"//{address}").hostname or ""

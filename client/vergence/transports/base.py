@@ -1,4 +1,4 @@
-"""What a session needs of a transport; everything else is written once, above it."""
+"""The protocol of a transport; everything above it is written once for all of them."""
 
 from typing import Protocol, TypeVar
 
@@ -11,34 +11,40 @@ Answer = TypeVar("Answer", bound=Message)
 
 
 class ConnectionLost(NotReady):
-    """The server cannot be reached, or the way to it broke; a session tries to resume."""
+    """The server cannot be reached, or the connection to it broke.
+
+    A session reconnects by itself first. Raised from a session it is final for the frame, or, if
+    the message says so, for the session.
+    """
 
 
 class Call(Protocol):
     """One attachment to a stream: requests go up, responses come down, each in order."""
 
     async def send(self, request: bytes) -> None:
-        """Hand over one ``pb.StreamDepthRequest``, serialized, waiting while the way is full.
+        """Send one serialized ``pb.StreamDepthRequest``; waits while buffers are full.
 
-        A message to a call that has ended is lost without a word here: ``receive`` says why.
+        A message to a call that has ended is discarded silently; ``receive`` raises the reason.
         """
 
     async def receive(self) -> pb.StreamDepthResponse | None:
-        """The next message; None once the server has ended the call in peace.
+        """Return the next message; None once the server has ended the call without an error.
 
         Raises the DepthError with which the server ended the call, or ConnectionLost.
         """
 
     async def close(self) -> None:
-        """Give the call up, wherever it stands."""
+        """Abort the call."""
 
 
 class Transport(Protocol):
+    """One connection to a server, or to the servers of one Zenoh namespace."""
+
     async def open_call(self, stream_id: str) -> Call:
         """Start a StreamDepth call; every frame of ``stream_id`` must reach the same server."""
 
     async def ask(self, method: str, request: Message, answer: type[Answer]) -> Answer:
-        """One request, one answer: a unary method of DepthService by its name."""
+        """Call a unary method of DepthService by its name."""
 
     async def close(self) -> None:
         """Close the connection; calls that are still open end with ConnectionLost."""

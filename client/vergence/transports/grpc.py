@@ -1,4 +1,4 @@
-"""gRPC: one HTTP/2 connection per client."""
+"""The gRPC transport: one HTTP/2 connection per client."""
 
 import asyncio
 import contextlib
@@ -16,15 +16,15 @@ from vergence_proto.zenoh.keys import STREAM_ID_METADATA
 
 _SERVICE = "/vergence.v1.DepthService/"
 _ASK_TIMEOUT_S = 10.0
-# What gRPC says of a call whose end met a write, see _GrpcCall._keep_status.
+# The details that gRPC invents when a call ends during a write, see _GrpcCall._keep_status.
 _WRITE_FAILED = "Internal error from Core"
 _STATUS_TIMEOUT_S = 1.0
 
 _CHANNEL_OPTIONS = (
-    # Images exceed gRPC's default of 4 MiB; what is too large is for the server to say.
+    # Images exceed gRPC's default of 4 MiB; the server has a limit of its own.
     ("grpc.max_send_message_length", -1),
     ("grpc.max_receive_message_length", -1),
-    # Without these a server that vanished silently is noticed after two hours.
+    # Without these, a server that vanished silently would be noticed after two hours.
     ("grpc.keepalive_time_ms", 10_000),
     ("grpc.keepalive_timeout_ms", 5_000),
     # gRPC itself waits 1 s to 2 min between attempts and fails every call made meanwhile; the
@@ -47,7 +47,7 @@ class GrpcTransport:
     async def open_call(self, stream_id: str) -> Call:
         start = self._channel.stream_stream(
             f"{_SERVICE}StreamDepth",
-            request_serializer=bytes,  # they come serialized
+            request_serializer=bytes,  # requests are serialized already
             response_deserializer=pb.StreamDepthResponse.FromString,
         )
         call = start(request_iterator=None, metadata=((STREAM_ID_METADATA, stream_id),))
@@ -83,19 +83,19 @@ class _GrpcCall:
         call.add_done_callback(self._keep_status)
 
     async def send(self, request: bytes) -> None:
-        # Both mean that the call has ended: before this write, or during it.
+        # Both errors mean that the call has ended, before this write or during it.
         with contextlib.suppress(asyncio.InvalidStateError, grpc.aio.AioRpcError):
             await self._call.write(request)
 
     async def receive(self) -> pb.StreamDepthResponse | None:
         try:
-            # Not read(): once a write has failed it leaves unread what has arrived, and the
-            # status comes behind that.
+            # Not read(): after a failed write it skips the messages that have arrived, and the
+            # status comes behind them.
             return await anext(self._responses, None)
         except grpc.aio.AioRpcError as error:
             raise _error_from_rpc(await self._why_ended(error), self._address) from None
         except asyncio.CancelledError:
-            # gRPC raises it also where nobody cancelled this task but the channel was closed.
+            # gRPC raises it also if the channel was closed and nobody cancelled this task.
             task = asyncio.current_task()
             if task is not None and task.cancelling():
                 raise
@@ -111,10 +111,10 @@ class _GrpcCall:
             return error
 
     def _keep_status(self, call: object) -> None:
-        """Keep the server's status as it comes.
+        """Keep the server's status.
 
-        A write that is under way when the call ends fails, and gRPC puts an INTERNAL of its own in
-        the place of what the server said, or says a moment later (grpc/grpc#36066).
+        If the call ends during a write, gRPC reports an INTERNAL status of its own instead of the
+        server's, which may arrive a moment later (grpc/grpc#36066).
         """
         status = _status_of(self._call)
         if status.details() != _WRITE_FAILED and not self._status.done():
@@ -124,7 +124,7 @@ class _GrpcCall:
 def _status_of(
     call: "grpc.aio.StreamStreamCall[bytes, pb.StreamDepthResponse]",
 ) -> grpc.aio.AioRpcError:
-    """Of a call that has ended: there is nothing to wait for, so this need not be awaited."""
+    """Return the status of a call that has ended; nothing is pending, so no await is needed."""
 
     async def read() -> grpc.aio.AioRpcError:
         metadata = await call.trailing_metadata()
@@ -141,8 +141,8 @@ def _status_of(
 
 
 def _error_from_rpc(error: grpc.aio.AioRpcError, address: str) -> DepthError:
-    """The class the server raised, by its ErrorInfo; without one the trouble is on the way."""
-    status = rpc_status.from_call(cast(grpc.Call, error))  # it has all that is read of one
+    """Return the error that the server raised, by its ErrorInfo, else a connection error."""
+    status = rpc_status.from_call(cast(grpc.Call, error))  # it has every method that is used
     ours = codec.error_from_status(status) if status is not None else None
     if ours is not None:
         return ours
@@ -151,6 +151,6 @@ def _error_from_rpc(error: grpc.aio.AioRpcError, address: str) -> DepthError:
         return FrameTooLarge(f"{address} refused the message: {details}")
     if code is grpc.StatusCode.UNIMPLEMENTED:
         return NotReady(f"{address} speaks gRPC but does not offer vergence.v1: {details}")
-    # The end of gRPC's sentence is the part that tells something.
+    # Only the end of gRPC's sentence is informative.
     reason = (details or code.name).rpartition("last error: ")[2].removeprefix("UNKNOWN: ")
     return ConnectionLost(f"no connection to {address}: {reason}")

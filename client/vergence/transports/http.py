@@ -1,4 +1,4 @@
-"""HTTP, for networks that let nothing else through: see :mod:`vergence_proto.http_records`."""
+"""The HTTP transport, for restricted networks: see :mod:`vergence_proto.http_records`."""
 
 from collections import deque
 from collections.abc import AsyncIterator
@@ -19,7 +19,7 @@ from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.zenoh.keys import STREAM_ID_METADATA
 
 _HEADERS = {"Content-Type": PROTOBUF_TYPE}
-# A session pings every second, so even the long answer of a call is never silent for longer.
+# A session pings every second, so the answer of a call is never silent for so long.
 _TIMEOUT_S = 10.0
 
 
@@ -27,7 +27,7 @@ class HttpTransport:
     """The :class:`~vergence.transports.base.Transport` to ``http://HOST:PORT`` (or https)."""
 
     def __init__(self, base_url: str) -> None:
-        # Every call has two connections; how many there are is the session's affair.
+        # Every call has two connections, and the number of sessions is not limited here.
         limits = httpx.Limits(max_connections=None, max_keepalive_connections=None)
         self._http = httpx.AsyncClient(base_url=base_url, limits=limits, timeout=_TIMEOUT_S)
 
@@ -72,7 +72,7 @@ class _HttpCall:
                 await self._open(request)
             elif self._error is None:
                 call_id = self._answer.headers[CALL_ID_HEADER]
-                # What is wrong with it is told by the call's own answer.
+                # Errors of this request arrive in the call's own answer.
                 await self._http.post(
                     f"/v1/streams/{call_id}", content=request, headers=self._headers
                 )
@@ -119,7 +119,7 @@ def _lost(http: httpx.AsyncClient, error: Exception) -> ConnectionLost:
 
 
 def _error_of(response: httpx.Response) -> DepthError:
-    """The class the server raised, by its problem's reason; without one it is another server."""
+    """Return the error that the server raised, by its reason; no reason: another server."""
     if response.headers.get("Content-Type") == "application/problem+json":
         problem = response.json()
         if "reason" in problem:

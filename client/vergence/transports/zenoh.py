@@ -1,4 +1,4 @@
-"""Zenoh: keys on a network of routers and peers, where any number of servers may be."""
+"""The Zenoh transport: a network of routers and peers with any number of servers."""
 
 import asyncio
 import random
@@ -11,29 +11,29 @@ from vergence.transports.base import Answer, Call, ConnectionLost
 from vergence.transports.zenoh_call import ServerInfos, ZenohCall
 from vergence_proto.errors import DepthError, StreamExpired, UnknownStream
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_proto.zenoh.keys import ANY, UNARY_KEYS, ask_key
-from vergence_proto.zenoh.session import ZenohPeer, make_config, reason_of
+from vergence_proto.zenoh.keys import ANY, UNARY_KEYS, query_key
+from vergence_proto.zenoh.session import ZenohSession, make_config, reason_of
 
-_ASK_TIMEOUT_S = 1.5  # a server that has not answered by then is as good as none
+_ASK_TIMEOUT_S = 1.5  # a slower server counts as absent
 _CONNECT_TIMEOUT_MS = 1000
-_MAX_MESSAGE_BYTES = 64 << 20  # of what comes: far above the largest map
+_MAX_MESSAGE_BYTES = 64 << 20  # limit on received messages, far above the largest map
 
 
 class ZenohTransport:
     """The :class:`~vergence.transports.base.Transport` to the servers of one namespace.
 
-    ``endpoint`` is that of a router, or of a server that is one: ``tcp/127.0.0.1:7447``. ``config``
-    is a Zenoh JSON5 file, for what TLS and access control need.
+    ``endpoint`` belongs to a router, or to a server that is one: ``tcp/127.0.0.1:7447``. ``config``
+    is a Zenoh JSON5 file with TLS and access control.
     """
 
     def __init__(self, endpoint: str, namespace: str, config: Path | None = None) -> None:
         self._endpoint = endpoint
         self._namespace = namespace
         self._config = config
-        self._peer: ZenohPeer | None = None
+        self._peer: ZenohSession | None = None
         self._closed = False
         self._turn = asyncio.Lock()
-        self._calls: dict[str, ZenohCall] = {}  # by stream, the latest of each that is not over
+        self._calls: dict[str, ZenohCall] = {}  # the latest call of each stream that has not ended
 
     async def open_call(self, stream_id: str) -> Call:
         peer = await self._connected()
@@ -49,7 +49,7 @@ class ZenohTransport:
         return call
 
     async def ask(self, method: str, request: Message, answer: type[Answer]) -> Answer:
-        """Of several servers that have an answer, the quickest's."""
+        """Return the first answer, if several servers have one."""
         return next(iter((await self._ask_all(method, request, answer)).values()))
 
     async def close(self) -> None:
@@ -61,7 +61,7 @@ class ZenohTransport:
             if peer is not None:
                 await peer.close()
 
-    async def _connected(self) -> ZenohPeer:
+    async def _connected(self) -> ZenohSession:
         async with self._turn:
             if self._closed:
                 raise RuntimeError("the client was closed")
@@ -72,9 +72,9 @@ class ZenohTransport:
                     mode="client",
                     connect__endpoints=[self._endpoint],
                     connect__timeout_ms=_CONNECT_TIMEOUT_MS,
-                    scouting__multicast__enabled=False,  # whatever the file says of it
+                    scouting__multicast__enabled=False,  # overrides the file
                 )
-                peer = ZenohPeer(config)
+                peer = ZenohSession(config)
                 try:
                     await peer.open()
                 except zenoh.ZError as error:
@@ -86,13 +86,13 @@ class ZenohTransport:
         return ConnectionLost(f"no connection to {self._endpoint}: {reason_of(error)}")
 
     async def _servers_for(self, stream_id: str, *, home: str) -> ServerInfos:
-        """Where to open a stream, best first: the server that has it, else by load.
+        """Return the servers for a stream, best first: the one that has it, else by load.
 
-        ``home`` is the server that had it, if it is to be resumed. Raises ConnectionLost: no
-        server answers, or not that one.
+        ``home`` is the server of a stream to resume. Raises ConnectionLost: no server answers, or
+        not ``home``.
         """
         question = pb.GetStreamRequest(stream_id=stream_id)
-        # Both at once: a server that hangs is waited for, and an opening has not long.
+        # Both at once: a server that hangs costs the whole timeout, and opening has a timeout too.
         infos, holders = await asyncio.gather(
             self._ask_all("GetServerInfo", pb.GetServerInfoRequest(), pb.GetServerInfoResponse),
             self._holders(question),
@@ -104,7 +104,7 @@ class ZenohTransport:
         return {each: infos[each] for each in ids}
 
     async def _holders(self, question: pb.GetStreamRequest) -> list[str]:
-        """Ids of the servers, one at most, that have the stream."""
+        """Return the id of the server that has the stream, if there is one."""
         try:
             return list(await self._ask_all("GetStream", question, pb.GetStreamResponse))
         except (UnknownStream, StreamExpired):
@@ -113,31 +113,31 @@ class ZenohTransport:
     async def _ask_all(
         self, method: str, question: Message, kind: type[Answer]
     ) -> dict[str, Answer]:
-        """What each server that knows an answer says, by its id.
+        """Return the answers by server id.
 
-        Raises the error that says most, if none does; ConnectionLost: there is no server.
+        Raises the most specific error if every server refuses; ConnectionLost: no server answers.
         """
         peer = await self._connected()
-        key = ask_key(self._namespace, ANY, UNARY_KEYS[method])
+        key = query_key(self._namespace, ANY, UNARY_KEYS[method])
         try:
-            answers = await peer.ask(key, question, timeout_s=_ASK_TIMEOUT_S)
+            answers = await peer.query(key, question, timeout_s=_ASK_TIMEOUT_S)
         except zenoh.ZError as error:
             raise self._lost(error) from None
         refusals = [each.error for each in answers if each.error is not None]
         if known := [each for each in answers if each.error is None]:
             return {each.server_id: kind.FromString(each.payload) for each in known}
         if refusals:
-            raise max(refusals, key=_says)
+            raise max(refusals, key=_specificity)
         raise ConnectionLost(
             f"no server answers in namespace {self._namespace!r} at {self._endpoint}"
         )
 
 
 def _load(info: pb.GetServerInfoResponse) -> tuple[float, float]:
-    # Of servers that are alike one by chance, or all clients would choose the same.
+    # Equal servers are chosen at random, or all clients would choose the same one.
     return info.streams_open / max(info.streams_max, 1), random.random()
 
 
-def _says(refusal: DepthError) -> int:
-    """That a server never had a stream says less than that another had it."""
+def _specificity(refusal: DepthError) -> int:
+    """UnknownStream is the least specific error: another server may have had the stream."""
     return 0 if isinstance(refusal, UnknownStream) else 1

@@ -1,4 +1,4 @@
-"""One attachment to a stream over Zenoh: a StreamDepth call made of keys."""
+"""One attachment to a stream over Zenoh: a StreamDepth call made of key expressions."""
 
 import secrets
 from collections import deque
@@ -23,46 +23,46 @@ from vergence_proto.errors import (
 )
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.zenoh.inbox import Inbox
-from vergence_proto.zenoh.keys import ANY, OPEN, StreamKeys, ask_key, server_key
-from vergence_proto.zenoh.session import Undeclarable, ZenohPeer, reason_of
+from vergence_proto.zenoh.keys import ANY, OPEN, StreamKeys, query_key, server_key
+from vergence_proto.zenoh.session import Declaration, ZenohSession, reason_of
 
 ServerInfos = dict[str, pb.GetServerInfoResponse]  # by server id, best first
 
 _OPEN_TIMEOUT_S = 3.0
-# A way that is open at one end only, or a server that hangs: no token tells of either.
+# A connection open at one end only, or a server that hangs: no liveliness token reports them.
 _PONG_PATIENCE_S = 5.0
-# No more maps are on the way than the server gives credit; past this the oldest would give way.
+# Above the server's credit; beyond this number the oldest map is discarded.
 _WAITING_MAPS = 16
-# The server would take the stream, had it room: another may have.
+# These refusals mean that the server has no room; another one may have.
 _NO_ROOM = (StreamLimit, StateMemory, Draining, NotReady)
 
 
 class ZenohCall:
     """A :class:`~vergence.transports.base.Call`.
 
-    What is lost on the way is found out and told as ``FramesDropped``, so that every frame is
-    answered here as it is over gRPC.
+    Frames lost on the network are detected and reported as ``FramesDropped``, so that every frame
+    is answered, as over gRPC.
     """
 
     def __init__(
         self,
-        peer: ZenohPeer,
+        peer: ZenohSession,
         namespace: str,
         stream_id: str,
         find_servers: Callable[[bool], Awaitable[ServerInfos]],
     ) -> None:
-        self.stream_id = stream_id
-        self.server_id = ""  # where the stream is open
-        self.over = False  # the server has ended the call; it was not lost
+        self.stream_id: str = stream_id
+        self.server_id: str = ""  # the server on which the stream is open
+        self.over: bool = False  # True: the server ended the call; it was not lost
         self._peer = peer
         self._namespace = namespace
         self._keys = StreamKeys(namespace, stream_id)
         self._find_servers = find_servers
         self._attachment_id = secrets.token_hex(8)
         self._inbox = Inbox(
-            self._attachment_id, bulky=pb.DisparityMap, room=_WAITING_MAPS, displaces=True
+            self._attachment_id, bulky=pb.DisparityMap, max_bulky=_WAITING_MAPS, drop_oldest=True
         )
-        self._declared: list[Undeclarable] = []
+        self._declared: list[Declaration] = []
         self._ready: deque[pb.StreamDepthResponse] = deque()
         self._live = True
         self._max_frame_bytes = 0
@@ -117,7 +117,7 @@ class ZenohCall:
         await self._peer.undeclare(*self._declared)
 
     def lose(self, why: str) -> None:
-        """End the call, for a session to resume it."""
+        """End the call as lost; the session resumes it."""
         self._inbox.end(ConnectionLost(why))
 
     async def _open(self, opening: pb.OpenStream) -> None:
@@ -127,23 +127,23 @@ class ZenohCall:
         declared.append(await peer.subscribe(self._keys.disparity, self._inbox.put))
         declared.append(await peer.subscribe(self._keys.status, self._inbox.put))
         declared.append(
-            await peer.watch_deaths(server_key(self._namespace, ANY), self._server_died)
+            await peer.watch_liveliness(server_key(self._namespace, ANY), self._server_died)
         )
-        declared.append(await peer.declare_alive(self._keys.client(self._attachment_id)))
+        declared.append(await peer.declare_liveliness(self._keys.client(self._attachment_id)))
         refusal: DepthError = ConnectionLost("no server answers")
         for self.server_id, info in servers.items():
-            key = ask_key(self._namespace, self.server_id, OPEN)
-            answers = await peer.ask(
+            key = query_key(self._namespace, self.server_id, OPEN)
+            answers = await peer.query(
                 key, opening, timeout_s=_OPEN_TIMEOUT_S, attachment_id=self._attachment_id
             )
             if not answers:
-                # It may still open the stream: another must not be asked to.
+                # It may still open the stream, so no other server is asked.
                 raise ConnectionLost(f"server {self.server_id} did not answer")
             error = answers[0].error
             if error is None:
                 self._max_frame_bytes = info.max_message_bytes
                 opened = pb.StreamOpened.FromString(answers[0].payload)
-                self._inbox.put_own(pb.StreamDepthResponse(opened=opened))
+                self._inbox.put_local(pb.StreamDepthResponse(opened=opened))
                 return
             refusal = error
             if not isinstance(error, _NO_ROOM):
@@ -155,13 +155,13 @@ class ZenohCall:
             self.lose(f"server {self.server_id} is gone, or the way to it")
 
     async def _send_frame(self, frame: pb.Frame) -> None:
-        # Far past its limit a server's Zenoh link drops a message without a word.
+        # Far above its limit, a server's Zenoh link drops a message silently.
         if (size := frame.ByteSize()) > self._max_frame_bytes:
             error = FrameTooLarge(
                 f"expected a frame of at most {self._max_frame_bytes} bytes, got {size}"
             )
             refusal = codec.error_to_frame_error(frame.frame_id, error)
-            self._inbox.put_own(pb.StreamDepthResponse(frame_error=refusal))
+            self._inbox.put_local(pb.StreamDepthResponse(frame_error=refusal))
             return
         self._unanswered.sent(frame.frame_id)
         await self._put(frame, may_drop=self._live)

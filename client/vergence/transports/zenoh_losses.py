@@ -1,4 +1,4 @@
-"""Which frames of a call have no answer yet, and which of those will never have one."""
+"""Detection of frames that were lost on a Zenoh network."""
 
 from collections.abc import Iterable
 
@@ -6,29 +6,31 @@ from vergence_proto.v1 import depth_pb2 as pb
 
 
 class Unanswered:
-    """What tells a lost frame from a late one.
+    """The frames of a call without an answer; it separates lost frames from late ones.
 
-    A live frame may be lost on the way, and so may its answer. Maps come in order, so each tells
-    which frames before it were lost; and each pong says which of the frames before its ping are
-    still to be answered, so that the last ones are not waited for in vain.
+    A live frame or its answer may be lost. Maps arrive in order, so each map proves that earlier
+    frames without an answer were lost. Each pong lists the frames before its ping that the server
+    will still answer, which finds losses among the last frames.
     """
 
     def __init__(self) -> None:
         self._frames: dict[int, None] = {}  # ids, in order
-        self._last_before: dict[int, int] = {}  # by ping: the last frame id sent before it
+        self._last_before: dict[int, int] = {}  # ping time: the last frame id sent before it
 
     def sent(self, frame_id: int) -> None:
+        """Record a frame that is sent now."""
         self._frames[frame_id] = None
 
     def pinged(self, client_ns: int) -> None:
+        """Record a ping that is sent now."""
         self._last_before[client_ns] = max(self._frames, default=0)
 
     def silent_s(self, now_ns: int) -> float:
-        """How long the oldest ping without a pong has been waiting."""
+        """Return the age in seconds of the oldest ping without a pong."""
         return (now_ns - min(self._last_before, default=now_ns)) * 1e-9
 
     def answered(self, response: pb.StreamDepthResponse) -> list[int]:
-        """Take in what came: the ids of the frames that it proves to be lost, in order."""
+        """Record a response; return the ids of the frames that it proves lost, in order."""
         lost: list[int] = []
         match response.WhichOneof("message"):
             case "disparity":
@@ -46,7 +48,7 @@ class Unanswered:
 
     def _lost_before(self, pong: pb.Pong) -> list[int]:
         last = self._last_before.get(pong.client_ns, 0)
-        # Pings before this one were lost, or their pongs were.
+        # Earlier pings, or their pongs, were lost.
         for client_ns in [each for each in self._last_before if each <= pong.client_ns]:
             del self._last_before[client_ns]
         waiting = set(pong.unanswered_frame_ids)

@@ -1,4 +1,4 @@
-"""The value that the generator and the pools hand to training: a batch of stereo clips."""
+"""A batch of stereo clips: the value that generator and pools pass to training."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class StereoClips:
     Pixel centres lie at integer coordinates. Axes are OpenCV's: x right, y down, z forward.
     """
 
-    left: Tensor  # uint8 [B, T, 3, H, W], RGB
+    left: Tensor  # uint8 [B, T, H, W, 3], RGB
     right: Tensor  # same shape as left
     disparity_px: Tensor  # float32 [B, T, H, W], u_left - u_right > 0; 0: nothing there (sky)
     visible: Tensor  # bool [B, T, H, W]: the left pixel's surface point is seen by the right eye
@@ -33,6 +33,10 @@ class StereoClips:
     @property
     def frames(self) -> int:
         return self.left.shape[1]
+
+    def pair(self, frame: int) -> tuple[Tensor, Tensor]:
+        """Left and right images of one frame of every clip, uint8 [B, H, W, 3], contiguous."""
+        return self.left[:, frame].contiguous(), self.right[:, frame].contiguous()
 
     def __getitem__(self, clips: slice) -> Self:
         return type(self)(*(getattr(self, f.name)[clips] for f in fields(self)))

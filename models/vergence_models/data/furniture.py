@@ -1,4 +1,4 @@
-"""Things that stand in rooms and streets, each built at the origin of a frame on the floor."""
+"""Objects in rooms and streets, each built at the origin of a frame on the floor."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vergence_models.data.materials import Material, Palette
+from vergence_models.data.materials import Material, MaterialPalette
 from vergence_models.data.scenes import Builder, look_along
 from vergence_models.data.shapes import Cutout, Shape
 
-Maker = Callable[[Builder, Palette, np.random.Generator, float], None]
+Maker = Callable[[Builder, MaterialPalette, np.random.Generator, float], None]
 
 
-def table(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> None:
-    """A table with four legs or one, and things on it. `s` scales, as in all of these."""
+def table(b: Builder, palette: MaterialPalette, rng: np.random.Generator, s: float) -> None:
+    """A table with four legs or one, and objects on it. `s` is the scale, as in all makers."""
     top = palette.textured(s, "wood", "photo", "clouds", "tiles")
     w, d, h = rng.uniform(0.4, 0.9) * s, rng.uniform(0.3, 0.6) * s, rng.uniform(0.4, 0.8) * s
     thick = 0.02 * s
@@ -33,7 +33,7 @@ def table(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> N
         trinket(b.at(x, -h - thick, z, yaw=rng.uniform(0, 6)), palette, rng, s)
 
 
-def trinket(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> None:
+def trinket(b: Builder, palette: MaterialPalette, rng: np.random.Generator, s: float) -> None:
     """A book pile, a vase, a ball, a cup or a lamp, to stand on something."""
     size = rng.uniform(0.04, 0.16) * s
     kind = rng.integers(5)
@@ -61,7 +61,7 @@ def trinket(b: Builder, palette: Palette, rng: np.random.Generator, s: float) ->
         b.post((0, -size * 3.2, 0), size, size * 0.7, palette.plain(tone=0.9), taper=-0.4)
 
 
-def chair(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> None:
+def chair(b: Builder, palette: MaterialPalette, rng: np.random.Generator, s: float) -> None:
     wood = palette.wood(0.7 * s)
     seat = palette.textured(0.5 * s) if rng.random() < 0.6 else wood
     w, h, leg = rng.uniform(0.18, 0.26) * s, rng.uniform(0.4, 0.5) * s, rng.uniform(0.01, 0.025) * s
@@ -79,7 +79,7 @@ def chair(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> N
         b.box((0, -back, w - leg), (w, 0.03 * s, leg), wood)
 
 
-def cabinet(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> None:
+def cabinet(b: Builder, palette: MaterialPalette, rng: np.random.Generator, s: float) -> None:
     body = palette.textured(s, "wood", "photo", "clouds") if rng.random() < 0.7 else palette.plain()
     w, h, d = rng.uniform(0.25, 0.7) * s, rng.uniform(0.3, 1.0) * s, rng.uniform(0.15, 0.3) * s
     b.box((0, -h, 0), (w, h, d), body)
@@ -96,7 +96,7 @@ def cabinet(b: Builder, palette: Palette, rng: np.random.Generator, s: float) ->
         trinket(b.at(rng.uniform(-w, w) * 0.7, -2 * h, 0), palette, rng, s)
 
 
-def bookshelf(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> None:
+def bookshelf(b: Builder, palette: MaterialPalette, rng: np.random.Generator, s: float) -> None:
     wood = palette.wood(s)
     w, h, d = rng.uniform(0.3, 0.6) * s, rng.uniform(0.5, 1.1) * s, 0.14 * s
     boards = int(rng.integers(3, 6))
@@ -118,7 +118,7 @@ def bookshelf(b: Builder, palette: Palette, rng: np.random.Generator, s: float) 
             x += 2 * t + (rng.uniform(0, 0.15) * s if rng.random() < 0.2 else 0.002 * s)
 
 
-def sofa(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> None:
+def sofa(b: Builder, palette: MaterialPalette, rng: np.random.Generator, s: float) -> None:
     fabric = palette.textured(0.4 * s, "weave", "plaid", "clouds", "photo")
     if rng.random() < 0.4:
         fabric = palette.plain()
@@ -132,7 +132,7 @@ def sofa(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> No
         b.ball((x, -0.56 * s, 0.2 * s), (0.2 * s, 0.17 * s, 0.09 * s), palette.textured(0.3 * s))
 
 
-def plant(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> None:
+def plant(b: Builder, palette: MaterialPalette, rng: np.random.Generator, s: float) -> None:
     """A pot with leaves on all sides."""
     r = rng.uniform(0.1, 0.2) * s
     b.post((0, -r, 0), r, r, palette.any(0.3 * s), taper=0.2)
@@ -152,7 +152,7 @@ def plant(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> N
               cutout=Cutout.LEAF)  # fmt: skip
 
 
-def leaf_material(palette: Palette, rng: np.random.Generator, s: float) -> Material:
+def leaf_material(palette: MaterialPalette, rng: np.random.Generator, s: float) -> Material:
     green = np.array([0.25, 0.5, 0.2]) * rng.uniform(0.5, 1.4) + rng.normal(0, 0.05, 3)
     r, g, c = (float(x) for x in np.clip(green, 0.02, 0.9))
     contrast = rng.uniform(0.1, 0.6)
@@ -161,7 +161,7 @@ def leaf_material(palette: Palette, rng: np.random.Generator, s: float) -> Mater
     return Material(palette.texture("clouds", "speckle", "stones"), span_m, gain, (r, g, c))
 
 
-def floor_lamp(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> None:
+def floor_lamp(b: Builder, palette: MaterialPalette, rng: np.random.Generator, s: float) -> None:
     h = rng.uniform(1.2, 1.8) * s
     metal = palette.polished() if rng.random() < 0.5 else palette.plain()
     b.post((0, -h / 2, 0), rng.uniform(0.006, 0.02) * s, h / 2, metal)
@@ -169,7 +169,7 @@ def floor_lamp(b: Builder, palette: Palette, rng: np.random.Generator, s: float)
     b.post((0, -h, 0), 0.17 * s, 0.13 * s, palette.lamp(), taper=-0.3)
 
 
-def crates(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> None:
+def crates(b: Builder, palette: MaterialPalette, rng: np.random.Generator, s: float) -> None:
     y = 0.0
     for _ in range(int(rng.integers(1, 4))):
         half = rng.uniform(0.08, 0.3, 3) * s
@@ -178,7 +178,7 @@ def crates(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> 
         y -= 2 * half[1]
 
 
-def railing(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> None:
+def railing(b: Builder, palette: MaterialPalette, rng: np.random.Generator, s: float) -> None:
     """Thin upright bars below a rail."""
     bars = int(rng.integers(4, 12))
     spacing, h = rng.uniform(0.06, 0.16) * s, rng.uniform(0.7, 1.1) * s
@@ -189,7 +189,7 @@ def railing(b: Builder, palette: Palette, rng: np.random.Generator, s: float) ->
     b.box((-spacing / 2, -h, 0), (bars * spacing / 2, 0.02 * s, 0.03 * s), skin)
 
 
-def pole(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> None:
+def pole(b: Builder, palette: MaterialPalette, rng: np.random.Generator, s: float) -> None:
     h = rng.uniform(1.0, 3.0) * s
     skin = palette.any(0.5 * s)
     b.post((0, -h / 2, 0), rng.uniform(0.01, 0.06) * s, h / 2, skin)
@@ -198,7 +198,7 @@ def pole(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> No
         b.wall((0, -h, -0.03), 0.25 * s, 0.25 * s, palette.textured(0.5 * s), cutout=round_sign)
 
 
-def tree(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> None:
+def tree(b: Builder, palette: MaterialPalette, rng: np.random.Generator, s: float) -> None:
     trunk, h = rng.uniform(0.08, 0.25) * s, rng.uniform(1.5, 3.0) * s
     b.post((0, -h / 2, 0), trunk, h / 2, palette.textured(0.5 * s, "wood", "clouds"), taper=-0.2)
     leaf = leaf_material(palette, rng, 4 * s)
@@ -212,7 +212,7 @@ def tree(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> No
         b.add(Shape.QUAD, at, half, leaf, rotation=turned, cutout=Cutout.LEAF)
 
 
-def car(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> None:
+def car(b: Builder, palette: MaterialPalette, rng: np.random.Generator, s: float) -> None:
     shiny = rng.random() < 0.6
     paint = palette.polished(mirror=rng.uniform(0.1, 0.4)) if shiny else palette.plain()
     glass, tyre = palette.polished(mirror=0.6), palette.plain(tone=0.1)

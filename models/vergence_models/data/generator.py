@@ -19,22 +19,22 @@ from vergence_models.data.views import Shot
 
 @dataclass(frozen=True, slots=True)
 class GeneratorConfig:
-    """What to generate; everything else about a clip is drawn from its seed."""
+    """The settings of a generator; everything else about a clip is drawn from its seed."""
 
     width: int = 256
     height: int = 192
     frames: int = 4
     rate_hz: float = 30.0
-    largest_zoom: float = 1.0  # clips are windows of a camera up to so many times as wide and high
+    largest_zoom: float = 1.0  # clips are windows of a camera image up to so many times as large
     mix: Mix | None = None  # shares of the kinds of scene; None: those of training
-    playback: Playback | None = None  # the camera's speed; None: drawn anew for each clip
+    playback: Playback | None = None  # the camera's speed; None: a random speed for each clip
     textures: Path | None = None  # a folder of photographs; None: procedural textures only
     bank_seed: int = 0
     texture_size: int = 256
 
 
 class ClipGenerator:
-    """Renders clean clips; clip number `index` of seed `seed` is the same whoever asks."""
+    """Renders clean clips; a seed and an index always give the same clip."""
 
     def __init__(self, config: GeneratorConfig, *, device: torch.device | str = "cpu") -> None:
         self.config = config

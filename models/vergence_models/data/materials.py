@@ -1,4 +1,4 @@
-"""What surfaces are made of: a texture with gain and bias, and how they shine."""
+"""Materials of surfaces: a texture with gain and bias, gloss, mirroring and glow."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class Material:
     span_m: float  # metres that one repeat of the texture covers
     gain: RGB = (1.0, 1.0, 1.0)
     bias: RGB = (0.0, 0.0, 0.0)
-    offset: tuple[float, float] = (0.0, 0.0)  # in repeats
+    offset: tuple[float, float] = (0.0, 0.0)  # shift of the texture, in repeats
     specular: float = 0.0
     shininess: float = 20.0
-    mirror: float = 0.0  # share of the surroundings that it reflects
+    mirror: float = 0.0  # share of the colour that comes from reflected surroundings
     glow: float = 0.0
 
     def row(self) -> list[float]:
@@ -31,7 +31,7 @@ class Material:
 MATERIAL_COLUMNS = 14
 
 
-class Palette:
+class MaterialPalette:
     """Draws random materials from a bank's textures."""
 
     def __init__(self, rng: np.random.Generator, kinds: tuple[str, ...]) -> None:
@@ -86,7 +86,7 @@ class Palette:
         return self.textured(size_m, "wood")
 
     def polished(self, *, mirror: float | None = None) -> Material:
-        """Metal, glass or a mirror: it shows its surroundings more than itself."""
+        """Metal, glass or a mirror: mostly its surroundings are visible in it."""
         share = float(self._rng.uniform(0.2, 0.9)) if mirror is None else mirror
         r, g, b = np.clip(self._rng.uniform(0.2, 0.7) + self._rng.normal(0, 0.04, 3), 0, 1)
         return Material(

@@ -1,17 +1,19 @@
-"""Open settings: streets under the sky, and swarms of things before a far background."""
+"""Outdoor scenes: streets under the sky, and swarms of objects before a far background."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from vergence_models.data import furniture
-from vergence_models.data.materials import Palette
-from vergence_models.data.scenes import Builder, Light, Scene, look_along, turn_y
-from vergence_models.data.settings import Viewpoint, compose, float_about, light_color, spot
+from vergence_models.data.materials import MaterialPalette
+from vergence_models.data.scenes import Builder, PointLight, Scene, look_along, turn_y
 from vergence_models.data.shapes import Shape
+from vergence_models.data.surroundings import Viewpoint, compose, float_about, light_color, spot
 
 
-def street(rng: np.random.Generator, palette: Palette, view: Viewpoint) -> tuple[Scene, float]:
+def street(
+    rng: np.random.Generator, palette: MaterialPalette, view: Viewpoint
+) -> tuple[Scene, float]:
     """A road or a square between facades, under the sky, and the height of the camera."""
     s = max(1.0, view.nearest_m / 4)
     camera_height = rng.uniform(1.2, 3.0) * s
@@ -56,15 +58,17 @@ def street(rng: np.random.Generator, palette: Palette, view: Viewpoint) -> tuple
            up_m=camera_height, moving=0.3)  # fmt: skip
     sun = np.array([rng.normal(0, 60), -rng.uniform(40, 120), rng.uniform(-40, 60)]) * s
     lights = (
-        Light(sun, light_color(rng, 1.6), 1000 * s),
-        Light(np.array([0, -30.0 * s, 0]), light_color(rng, 0.3), 1000 * s),
+        PointLight(sun, light_color(rng, 1.6), 1000 * s),
+        PointLight(np.array([0, -30.0 * s, 0]), light_color(rng, 0.3), 1000 * s),
     )
     target = np.array([0, 0, 15.0 * s])
     scene = compose(b, rng, palette, lights, target, 0.35, sky=True)
     return scene, float(camera_height)
 
 
-def swarm(rng: np.random.Generator, palette: Palette, view: Viewpoint) -> tuple[Scene, float]:
+def swarm(
+    rng: np.random.Generator, palette: MaterialPalette, view: Viewpoint
+) -> tuple[Scene, float]:
     """Many textured things afloat before a textured far background; the camera is at height 0."""
     far = view.nearest_m * float(np.exp(rng.uniform(np.log(4), np.log(40))))
     b = Builder()
@@ -77,8 +81,8 @@ def swarm(rng: np.random.Generator, palette: Palette, view: Viewpoint) -> tuple[
     float_about(b, palette, rng, view, count, far_m=far, up_m=0.0, moving=0.6, large=True)
     lamp = np.array([rng.normal(0, 0.4), -0.8, -0.2]) * far
     lights = (
-        Light(lamp, light_color(rng, 1.5), 3 * far),
-        Light(rng.normal(0, 0.5, 3) * far, light_color(rng, 0.6), 2 * far),
+        PointLight(lamp, light_color(rng, 1.5), 3 * far),
+        PointLight(rng.normal(0, 0.5, 3) * far, light_color(rng, 0.6), 2 * far),
     )
     target = np.array([0, 0, far * 0.6])
     return compose(b, rng, palette, lights, target, 0.8, sky=True), 0.0

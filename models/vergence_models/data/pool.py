@@ -1,9 +1,9 @@
 """Pre-rendered clips on disk: `python -m vergence_models.data.pool --out DIR ...` and `ClipPool`.
 
 A pool is a folder of shards, `shard_SEED_FIRST/`, each a few .npy files of clips of one size, so
-that training memory-maps them. Clips are clean; the sensor is simulated anew each time they are
-used. A shard is written under another name and renamed when whole: a pool may be read while it
-grows, and a stopped run goes on where it was.
+that training memory-maps them. Clips are clean; the sensor is simulated each time they are used.
+A shard is written under another name and renamed when complete: a pool may be read while it
+grows, and a stopped run continues where it was.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class ClipPool:
             raise FileNotFoundError(f"no shards{wanted} in {', '.join(map(str, folders))}")
 
     def refresh(self) -> None:
-        """Take up shards that have appeared since; the first shard fixes size and length."""
+        """Add new shards on disk; the first shard fixes size and length."""
         for folder in self._folders:
             for path in sorted(folder.glob("shard_*_*")):
                 if path in self._shards or path.suffix:
@@ -96,16 +96,16 @@ class ClipPool:
         skip: float = 0.0,
         flip: float = 0.0,
     ) -> StereoClips:
-        """A random batch; the last three are chances.
+        """A random batch; the last three arguments are probabilities.
 
         Args:
             rng: the only source of randomness.
             batch: how many clips, drawn with replacement.
             frames: how many frames of each, by default all; a shorter clip is played to and fro.
             crop: width and height of a random window, by default the whole image.
-            reverse: of playing a clip backwards.
-            skip: of taking every other frame, where a clip is long enough.
-            flip: of turning a clip upside down (left and right would swap the eyes).
+            reverse: probability to play a clip backwards.
+            skip: probability to take every other frame, where a clip is long enough.
+            flip: probability to turn a clip upside down (left and right would swap the eyes).
         """
         parts = []
         for index in rng.integers(len(self), size=batch):
@@ -129,7 +129,7 @@ def _to_and_fro(steps: NDArray[np.int_], frames: int) -> NDArray[np.int_]:
 
 
 def _read(shard: _Shard, row: int) -> StereoClips:
-    images = torch.from_numpy(np.array(shard.images[row])).permute(1, 0, 4, 2, 3)
+    images = torch.from_numpy(np.array(shard.images[row])).transpose(0, 1)
     disparity = shard.disparity[row].astype(np.float32) / DISPARITY_SCALE
     width = disparity.shape[-1]
     visible = np.unpackbits(shard.visible[row], axis=-1, count=width).astype(bool)
@@ -164,7 +164,7 @@ def _crop(clip: StereoClips, rng: np.random.Generator, width: int, height: int) 
     disparity = clip.disparity_px[..., rows, columns]
     matched = torch.arange(width) - disparity >= 0
     return StereoClips(
-        clip.left[..., rows, columns], clip.right[..., rows, columns], disparity,
+        clip.left[:, :, rows, columns], clip.right[:, :, rows, columns], disparity,
         clip.visible[..., rows, columns] & matched, clip.world_from_left,
         clip.fx, clip.fy, clip.cx - x, clip.cy - y, clip.baseline_m,
     )  # fmt: skip
@@ -175,18 +175,18 @@ def _upside_down(clip: StereoClips) -> StereoClips:
     mirror = torch.diag(torch.tensor([1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
     height = clip.disparity_px.shape[-2]
     return StereoClips(
-        clip.left.flip(-2), clip.right.flip(-2), clip.disparity_px.flip(-2), clip.visible.flip(-2),
+        clip.left.flip(2), clip.right.flip(2), clip.disparity_px.flip(2), clip.visible.flip(2),
         mirror @ clip.world_from_left @ mirror,
         clip.fx, clip.fy, clip.cx, height - 1 - clip.cy, clip.baseline_m,
     )  # fmt: skip
 
 
 def write_shard(folder: Path, clips: StereoClips) -> None:
-    """Write clips as one shard; the folder appears when it is whole."""
+    """Write clips as one shard; the folder appears when it is complete."""
     partial = folder.with_suffix(".partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
-    images = torch.stack([clips.left, clips.right], dim=2).permute(0, 1, 2, 4, 5, 3)
+    images = torch.stack([clips.left, clips.right], dim=2)
     disparity = (clips.disparity_px.double() * DISPARITY_SCALE).round().clamp(0, 65535)
     camera = torch.stack([clips.fx, clips.fy, clips.cx, clips.cy, clips.baseline_m], dim=1)
     shard = _Shard(
@@ -211,7 +211,7 @@ def _render_shard(folder: Path, config: GeneratorConfig, seed: int, indices: ran
     return len(indices)
 
 
-_kept: dict[GeneratorConfig, ClipGenerator] = {}  # a worker's texture bank outlives its shards
+_kept: dict[GeneratorConfig, ClipGenerator] = {}  # a worker uses its texture bank for all shards
 
 
 def _generator(config: GeneratorConfig) -> ClipGenerator:
@@ -223,7 +223,7 @@ def _generator(config: GeneratorConfig) -> ClipGenerator:
 def render_pool(
     out: Path, config: GeneratorConfig, *, clips: int, seed: int, shard_clips: int, workers: int
 ) -> int:
-    """Render what is missing of a pool's first `clips` clips; returns how many that were."""
+    """Render the missing ones of a pool's first `clips` clips; returns their number."""
     missing = []
     for first in range(0, clips, shard_clips):
         folder = out / f"shard_{seed}_{first:06d}"
@@ -260,13 +260,13 @@ def main(
     size: Annotated[str, typer.Option(metavar="WxH")] = "256x192",
     seed: Annotated[int, typer.Option()] = 0,
     zoom: Annotated[
-        float, typer.Option(min=1, help="Up to so many times sharper: windows of a larger image.")
+        float, typer.Option(min=1, help="Clips are windows of an image up to so many times larger.")
     ] = 1.0,
     textures: Annotated[Path | None, typer.Option(help="Folder of photographs.")] = None,
     shard_clips: Annotated[int, typer.Option(min=1, help="Clips in a shard.")] = 50,
     workers: Annotated[int, typer.Option(min=1, help="Processes, one thread each.")] = 1,
 ) -> None:
-    """Render a pool of clean clips, or go on with one that was stopped."""
+    """Render a pool of clean clips, or continue one that was stopped."""
     width, height = (int(side) for side in size.split("x"))
     if workers == 1:
         torch.set_num_threads(1)  # the arrays are too small to be shared among threads

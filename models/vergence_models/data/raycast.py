@@ -1,4 +1,4 @@
-"""Which primitive does each pixel see, and how deep: tiled ray casting, batched over views.
+"""Tiled ray casting, batched over views: the visible primitive of each pixel, and its depth.
 
 Primitives are binned into square tiles of the image by the bounds of their boxes, so a ray meets
 only the few primitives near it. Depth is that of the exact ray through the pixel centre.
@@ -46,14 +46,14 @@ class Cameras(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Hits:
-    """What the pixel centres of V views see."""
+class RayHits:
+    """The first hits of the rays through the pixel centres of V views."""
 
     depth_m: Tensor  # float32 [V, H, W] along the optical axis; infinite where nothing is hit
     primitive: Tensor  # int64 [V, H, W], index m into `Primitives`; -1 where nothing is hit
 
 
-def cast(primitives: Primitives, cameras: Cameras) -> Hits:
+def cast(primitives: Primitives, cameras: Cameras) -> RayHits:
     """The nearest hit at every pixel centre of every view."""
     rows, columns = -(-cameras.height // TILE_PX), -(-cameras.width // TILE_PX)
     device = primitives.shape.device
@@ -92,7 +92,7 @@ def cast(primitives: Primitives, cameras: Cameras) -> Hits:
                 )
 
     size = (primitives.views, cameras.height, cameras.width)
-    return Hits(_untile(depth, rows, columns, size), _untile(owner, rows, columns, size).long())
+    return RayHits(_untile(depth, rows, columns, size), _untile(owner, rows, columns, size).long())
 
 
 def intersect_rays(

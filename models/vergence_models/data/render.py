@@ -11,7 +11,7 @@ from torch import Tensor
 
 from vergence_models.data import scenes
 from vergence_models.data.clips import StereoClips
-from vergence_models.data.raycast import Cameras, Hits, Primitives, cast, intersect_rays
+from vergence_models.data.raycast import Cameras, Primitives, RayHits, cast, intersect_rays
 from vergence_models.data.shading import FACES, Illumination, shade
 from vergence_models.data.shapes import Shape
 from vergence_models.data.textures import TextureBank
@@ -48,7 +48,6 @@ def render(
     color = _color(primitives, table, cameras, hits, light, bank)
     color = color.view(count, frames * 2, height, width, 3)
     image = _develop(color, shots).view(count, frames, 2, height, width, 3)
-    image = image.permute(0, 1, 2, 5, 3, 4).contiguous()
 
     disparity = (focal * per_view([s.baseline_m for s in shots]))[:, None, None] / hits.depth_m
     disparity = disparity.view(count, frames, 2, height, width)
@@ -139,7 +138,7 @@ def _shadow_maps(rows: Tensor, shots: list[Shot]) -> tuple[Tensor, Tensor, list[
 
 
 def _color(
-    primitives: Primitives, table: Tensor, cameras: Cameras, hits: Hits, light: Illumination,
+    primitives: Primitives, table: Tensor, cameras: Cameras, hits: RayHits, light: Illumination,
     bank: TextureBank,
 ) -> Tensor:  # fmt: skip
     """Linear RGB [V, H, W, 3]: one sample a pixel, and four where a surface ends."""
@@ -181,7 +180,7 @@ def _neighbours(surface: Tensor) -> Tensor:
 
 
 def _nearest_of(primitives: Primitives, candidates: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """Which of K candidates [K, N] rays [N, S] hit first: 0 where they slip through them all."""
+    """The index of the first of K candidates [K, N] that rays [N, S] hit; 0 if they hit none."""
     depth = torch.full(x.shape, float("inf"), device=x.device)
     # Candidate -1 is the sky, behind everything; the pixel's own stands in where there is none.
     backdrop = torch.zeros_like(candidates[0])
@@ -206,7 +205,7 @@ def _nearest_of(primitives: Primitives, candidates: Tensor, x: Tensor, y: Tensor
 
 def _develop(color: Tensor, shots: list[Shot]) -> Tensor:
     """Linear RGB [B, V, H, W, 3] to uint8: one exposure a clip, a soft shoulder, gamma."""
-    # Of the last left view: clips that end with the same view show it alike (see shots.Playback).
+    # The last left view sets it: clips that end with one view show it alike (see shots.Playback).
     brightness = color[:, -2:-1].mean(dim=(1, 2, 3, 4)).clamp(min=1e-3)
     aim = column([s.scene.exposure for s in shots], color.device)
     exposed = color * (aim / brightness)[:, None, None, None, None]
@@ -216,7 +215,7 @@ def _develop(color: Tensor, shots: list[Shot]) -> Tensor:
 
 
 def _visible_in_right(left: Tensor, right: Tensor) -> Tensor:
-    """Whether the surface point of each left pixel is seen by the right eye: bool, as `left`.
+    """A mask of left pixels whose surface point the right eye sees: bool, as `left`.
 
     Between two neighbouring pixels of the right image a plane's disparity is linear, so a point is
     hidden only where both of them are nearer than it.

@@ -20,10 +20,10 @@ from rich.progress import track
 
 from vergence_models.data import furniture
 from vergence_models.data.clips import StereoClips
-from vergence_models.data.materials import Material, Palette
+from vergence_models.data.materials import Material, MaterialPalette
 from vergence_models.data.pool import DISPARITY_SCALE
 from vergence_models.data.render import render
-from vergence_models.data.scenes import Builder, Light, Scene
+from vergence_models.data.scenes import Builder, PointLight, Scene
 from vergence_models.data.shapes import Cutout
 from vergence_models.data.textures import TextureBank
 from vergence_models.data.trajectories import HeadMotion, rotation
@@ -32,13 +32,13 @@ from vergence_models.data.views import Shot
 _RATE_HZ = 30
 _BASELINE_M = 0.1
 _FOCAL_PER_WIDTH = 0.625  # 77 degrees across
-_NOISE = 1.0  # standard deviation, grey levels
+_NOISE = 1.0  # standard deviation of the sensor noise, grey levels
 
 
 def living_room(kinds: tuple[str, ...]) -> Scene:
     """A room of 5.2 by 5.6 m; the camera stands at its near end and looks along z."""
     rng = np.random.default_rng(28)
-    palette = Palette(rng, kinds)
+    palette = MaterialPalette(rng, kinds)
     b = Builder()
     oak = _stain(palette, "wood", 1.9, (1.25, 1.06, 0.84), base=(0.10, 0.09, 0.07))
     pine = _stain(palette, "wood", 0.9, (0.95, 0.85, 0.7), base=(0.25, 0.22, 0.17))
@@ -62,7 +62,7 @@ def living_room(kinds: tuple[str, ...]) -> Scene:
     def seeded(seed: int) -> np.random.Generator:
         return np.random.default_rng(seed)
 
-    def decor(seed: int, wood: Material) -> Palette:
+    def decor(seed: int, wood: Material) -> MaterialPalette:
         return _Decor(seeded(seed), kinds, wood)
 
     furniture.sofa(b.at(-0.25, 0, 2.65), decor(2, blue), seeded(32), 1.0)
@@ -87,8 +87,8 @@ def living_room(kinds: tuple[str, ...]) -> Scene:
     window.wall((0, 0, 0), 0.65, 0.75, palette.lamp())
     window.wall((0, 0, -0.02), 0.65, 0.75, white, cutout=Cutout.GRID)
     lights = (
-        Light(np.array([-1.6, -2.35, -0.9]), np.array([1.0, 0.93, 0.82]) * 1.7, 3.5),
-        Light(np.array([-2.3, -1.6, 1.9]), np.array([0.85, 0.95, 1.1]) * 0.9, 2.5),
+        PointLight(np.array([-1.6, -2.35, -0.9]), np.array([1.0, 0.93, 0.82]) * 1.7, 3.5),
+        PointLight(np.array([-2.3, -1.6, 1.9]), np.array([0.85, 0.95, 1.1]) * 0.9, 2.5),
     )
     return Scene(
         primitives=np.array(b.rows, np.float32),
@@ -102,8 +102,8 @@ def living_room(kinds: tuple[str, ...]) -> Scene:
     )
 
 
-class _Decor(Palette):
-    """A palette with one given wood or cloth, and book covers for the rest."""
+class _Decor(MaterialPalette):
+    """A palette with one fixed wood or cloth, and book covers for everything else."""
 
     def __init__(self, rng: np.random.Generator, kinds: tuple[str, ...], wood: Material) -> None:
         super().__init__(rng, kinds)
@@ -127,7 +127,7 @@ class _Decor(Palette):
 
 
 def _stain(
-    palette: Palette, kind: str, span_m: float, gain: tuple[float, float, float], *,
+    palette: MaterialPalette, kind: str, span_m: float, gain: tuple[float, float, float], *,
     base: tuple[float, float, float],
 ) -> Material:  # fmt: skip
     return Material(palette.texture(kind), span_m, gain, base, specular=0.06, shininess=25.0)
@@ -175,11 +175,14 @@ def film(*, frames: int, width: int, height: int) -> StereoClips:
 
 
 def _halved(image: torch.Tensor, noise: torch.Generator) -> torch.Tensor:
-    clips, frames, channels, height, width = image.shape
-    mean = image.view(-1, height // 2, 2, width // 2, 2).float().mean(dim=(2, 4))
-    mean += _NOISE * torch.randn(mean.shape, generator=noise)
-    small = (mean + 0.5).clamp(0, 255).to(torch.uint8)
-    return small.view(clips, frames, channels, height // 2, width // 2)
+    clips, frames, height, width, channels = image.shape
+    size = (clips, frames, height // 2, width // 2)
+    blocks = image.reshape(clips, frames, height // 2, 2, width // 2, 2, channels)
+    mean = blocks.float().mean(dim=(3, 5))
+    # Plane by plane, as the shipped sequence was made.
+    drawn = torch.randn(clips * frames * channels, *size[2:], generator=noise)
+    mean += _NOISE * drawn.view(clips, frames, channels, *size[2:]).permute(0, 1, 3, 4, 2)
+    return (mean + 0.5).clamp(0, 255).to(torch.uint8)
 
 
 def write_sequence(folder: Path, clips: StereoClips, *, quality: int) -> None:
@@ -203,7 +206,7 @@ def write_sequence(folder: Path, clips: StereoClips, *, quality: int) -> None:
     np.savetxt(folder / "poses.txt", first_from_left[:, :3].reshape(-1, 12), fmt="%.9f")
     for index in range(clips.frames):
         for eye, images in (("left", clips.left), ("right", clips.right)):
-            bgr = images[0, index].permute(1, 2, 0).flip(-1).contiguous().cpu().numpy()
+            bgr = images[0, index].flip(-1).contiguous().cpu().numpy()
             path = folder / f"frame_{index:04d}_{eye}.webp"
             cv2.imwrite(str(path), bgr, [cv2.IMWRITE_WEBP_QUALITY, quality])
         disparity = clips.disparity_px[0, index].cpu().numpy().astype(np.float64)

@@ -24,7 +24,7 @@ COLUMNS = 38
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Light:
+class PointLight:
     position_m: NDArray[np.float64]  # [3], world
     color: NDArray[np.float64]  # [3], irradiance at `reach_m`
     reach_m: float  # irradiance falls to half of its maximum at this distance
@@ -33,7 +33,7 @@ class Light:
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
     primitives: NDArray[np.float32]  # [P, COLUMNS]
-    lights: tuple[Light, Light]  # the first one casts shadows
+    lights: tuple[PointLight, PointLight]  # the first one casts shadows
     shadow_target_m: NDArray[np.float64]  # [3]: where the first light's shadow map looks
     shadow_half_angle_rad: float
     ambient: NDArray[np.float64]  # [3]

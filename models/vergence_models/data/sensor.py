@@ -1,7 +1,7 @@
-"""The final pass: what a real pair of cameras does to clean images. Ground truth stays as it is.
+"""The flaws of real cameras, added to clean images. Ground truth stays as it is.
 
-Every effect is drawn anew for each clip from one numpy generator, so a pool of clean clips gives
-new pictures in every epoch.
+Every effect is drawn for each clip from one numpy generator, so a pool of clean clips yields new
+images in every epoch.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _NOISE_POOL = 1 << 20  # normal numbers drawn a batch; frames take random stretc
 
 @dataclass(frozen=True, slots=True)
 class SensorConfig:
-    """Chances of each effect in a clip, and how strong it gets at most."""
+    """The probability of each effect in a clip, and its largest strength."""
 
     noise: float = 0.8
     noise_levels: float = 7.0  # standard deviation, grey levels
@@ -42,7 +42,7 @@ class SensorConfig:
 def film_as_sensor(
     clips: StereoClips, rng: np.random.Generator, config: SensorConfig | None = None
 ) -> StereoClips:
-    """The same clips as cameras with flaws would have recorded them (works on the CPU)."""
+    """The same clips, as recorded by cameras with flaws (computed on the CPU)."""
     config = config or SensorConfig()
     noise = rng.standard_normal(_NOISE_POOL, dtype=np.float32)
     left, right = torch.empty_like(clips.left), torch.empty_like(clips.right)
@@ -63,7 +63,7 @@ class _Recording:
         def happens(chance: float) -> bool:
             return bool(rng.random() < chance)
 
-        frames, _, height, width = shape
+        frames, height, width, _ = shape
         self._rng = rng
         self._noise = noise
         shifts = happens(config.misalignment)
@@ -84,10 +84,10 @@ class _Recording:
         self._jpeg = int(rng.integers(35, 96)) if happens(config.jpeg) else None
 
     def eye(self, frames: Tensor, *, right: bool) -> Tensor:
-        """Record frames uint8 [T, 3, H, W] of one eye."""
-        images = np.ascontiguousarray(frames.permute(0, 2, 3, 1).cpu().numpy())
+        """Record frames uint8 [T, H, W, 3] of one eye."""
+        images = np.ascontiguousarray(frames.cpu().numpy())
         recorded = [self._record(image, t, right) for t, image in enumerate(images)]
-        return torch.from_numpy(np.stack(recorded)).permute(0, 3, 1, 2).to(frames.device)
+        return torch.from_numpy(np.stack(recorded)).to(frames.device)
 
     def _record(self, image: Image, frame: int, right: bool) -> Image:
         if right and self._shift_px:

@@ -17,14 +17,14 @@ from vergence_models.data.textures import TextureBank
 
 _CHUNK = 16384
 _MAX_ANISOTROPY = 6.0
-_SHADOW_BIAS = 0.008  # of the distance to the light
+_SHADOW_BIAS = 0.008  # share of the distance to the light
 _SHADOW_LIFT = 0.015  # likewise, along the surface's normal
 FACES = 8  # surface index = primitive * FACES + face
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Illumination:
-    """What shading needs of V views, as columns: lights in view axes, ambient, sky, shadow map."""
+    """Light of V views, as columns: lights in view axes, ambient light, sky, shadow map."""
 
     columns: Tensor  # float32 [C, V]; see `illumination_columns`
     shadow_depth_m: Tensor  # float32 [S, R, R], one map a scene
@@ -231,7 +231,7 @@ def _unit(vector: Tensor) -> Tensor:
 
 
 def _surroundings(bank: TextureBank, direction: Tensor, by_view: Tensor) -> Tensor:
-    """What lies at infinity in a direction (view axes) [3, N]: the sky texture wrapped around."""
+    """The colour at infinity in a direction (view axes) [3, N]: the sky texture wrapped around."""
     world = by_view[_WORLD : _WORLD + 9].view(3, 3, -1)
     x, y, z = (_dot(world[i], direction) for i in range(3))
     azimuth = torch.atan2(x, z)

@@ -19,7 +19,7 @@ Vector = tuple[Tensor, Tensor, Tensor]
 
 
 class Shape(IntEnum):
-    """What a primitive is; PAD fills scenes of a batch up to one length and is never hit."""
+    """The shape of a primitive; PAD fills scenes of a batch up to one length and is never hit."""
 
     PAD = -1
     QUAD = 0  # z = 0, |x|, |y| <= 1, cut by a `Cutout`

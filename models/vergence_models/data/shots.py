@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vergence_models.data.materials import Palette
+from vergence_models.data.indoors import clutter, room
+from vergence_models.data.materials import MaterialPalette
 from vergence_models.data.outdoors import street, swarm
-from vergence_models.data.rooms import clutter, room
 from vergence_models.data.scenes import Scene
-from vergence_models.data.settings import Viewpoint
+from vergence_models.data.surroundings import Viewpoint
 from vergence_models.data.trajectories import HeadMotion, rotation
 from vergence_models.data.views import Shot
 
@@ -29,8 +29,8 @@ class Mix:
 class Playback:
     """A calm head's motion, played back faster: one scene, one path and one last view.
 
-    Only the past differs between clips of different speeds, so what the speed costs can be told
-    from what the camera happens to see.
+    Only the past differs between clips of different speeds, so the effect of speed is separate
+    from the content of the view.
     """
 
     speed: float = 1.0
@@ -43,10 +43,10 @@ def draw_shot(
 ) -> Shot:  # fmt: skip
     """Draw everything about one clip. `kinds` names the textures of the bank that renders it.
 
-    The camera's speed is drawn too, unless `playback` sets it; moving things keep their own.
+    The camera's speed is random too, unless `playback` sets it; moving objects keep their own.
     """
     mix = mix or Mix()
-    palette = Palette(rng, kinds)
+    palette = MaterialPalette(rng, kinds)
     half_angle = np.radians(rng.uniform(50, 110)) / 2
     focal_px = width / 2 / np.tan(half_angle)
     low, high = (0.04, 0.2) if rng.random() < 0.8 else (0.2, 0.5)

@@ -15,7 +15,7 @@ _WAVES = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadMotion:
-    """Poses over time: `start_from_camera` gives the motion away from the start."""
+    """Poses over time: `start_from_camera` is the motion away from the start."""
 
     frequency_hz: NDArray[np.float64]  # [waves, 6]
     phase: NDArray[np.float64]  # [waves, 6]

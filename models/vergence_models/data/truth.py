@@ -1,4 +1,4 @@
-"""What else is known exactly about the left images of shots: normals, and where points go next."""
+"""More exact truth of the left images of shots: normals, flow and the next disparity."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vergence_models.data.views import Shot, both_eyes, column, in_views, padded
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceTruth:
-    """Of B shots of T frames; NaN where a pixel shows no surface."""
+    """Truth of B shots of T frames; NaN where a pixel shows no surface."""
 
     normals: Tensor  # float32 [B, T, 3, H, W], unit, left camera axes, towards the camera
     flow_px: Tensor  # float32 [B, T-1, 2, H, W]: where the point is in the next frame, minus here

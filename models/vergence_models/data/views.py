@@ -1,4 +1,4 @@
-"""Shots, and their primitives as every view of them sees them."""
+"""Shots, and their primitives in the axes of every view."""
 
 from __future__ import annotations
 

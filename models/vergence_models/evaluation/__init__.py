@@ -1,0 +1,1 @@
+"""Networks and SGBM stepped over footage, and the figures that compare them."""

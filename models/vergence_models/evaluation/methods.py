@@ -1,6 +1,6 @@
-"""The contestants of evaluation and studies: whatever turns footage into disparity.
+"""The methods of evaluation and studies: each turns footage into disparity.
 
-A method has a name and may be told something else than the truth about the camera's motion.
+A method has a name, and may see changed footage, for example with noisy camera motion.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Method:
     label: str
     predict: Callable[[Footage], Iterator[Prediction]]
 
-    def told(self, what: str, change: Callable[[Footage], Footage]) -> Method:
+    def with_input(self, what: str, change: Callable[[Footage], Footage]) -> Method:
         """The same method, shown changed footage."""
         return Method(f"{self.label}, {what}", lambda footage: self.predict(change(footage)))
 
@@ -35,8 +35,8 @@ def counted(iterations: int) -> str:
 
 
 def counted_start(network: SteppedNetwork, iterations: int) -> str:
-    closer = ", the last ones a closer look" if network.looks_closer(iterations) else ""
-    return counted(iterations) + closer
+    refined = ", the last ones at 2x" if network.refines_at_2x(iterations) else ""
+    return counted(iterations) + refined
 
 
 def warm_method(network: SteppedNetwork, name: str, iterations: int, *, cold: int) -> Method:
@@ -70,28 +70,28 @@ def sgbm_methods() -> list[Method]:
 
 
 def without_poses(footage: Footage) -> Footage:
-    """The network is told that nothing moves, so its state stays where it was."""
+    """Footage without camera motion: the network's state keeps its place."""
     return replace(footage, views=[replace(v, world_from_left=None) for v in footage.views])
 
 
 def with_pose_noise(footage: Footage, *, deg: float, m: float) -> Footage:
-    """The network is told motions that are off by just so much, from each frame to the next.
+    """Footage whose motion from each frame to the next is off by exactly this much.
 
-    The axis and the direction of each error are random, and the same whatever its size. Footage
-    without poses stays as it is.
+    The axis and the direction of each error are random, and the same for every size of the error.
+    Footage without poses stays as it is.
     """
     poses = [view.world_from_left for view in footage.views]
     if not (deg or m) or any(pose is None for pose in poses):
         return footage
     known = [pose for pose in poses if pose is not None]
     random = np.random.default_rng(zlib.crc32(footage.name.encode()))
-    told = known[:1]
+    noisy = known[:1]
     for before, now in itertools.pairwise(known):
         axis, direction = (v / np.linalg.norm(v) for v in random.standard_normal((2, 3)))
         curr_from_true = Pose(rotation(axis * np.radians(deg)), direction * m)
         prev_from_curr = before.inverse() @ now
-        told.append(told[-1] @ prev_from_curr @ curr_from_true.inverse())
+        noisy.append(noisy[-1] @ prev_from_curr @ curr_from_true.inverse())
     views = [
-        replace(view, world_from_left=pose) for view, pose in zip(footage.views, told, strict=True)
+        replace(view, world_from_left=pose) for view, pose in zip(footage.views, noisy, strict=True)
     ]
     return replace(footage, views=views)

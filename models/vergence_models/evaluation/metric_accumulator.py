@@ -9,14 +9,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from vergence_models.evaluation.metrics import calibration, error_measures, temporal_error
-from vergence_models.evaluation.stepping import Footage, Prediction, View
+from vergence_models.evaluation.stepping import Footage, FootageView, Prediction
 
-FRAME_PIXELS = 640 * 480  # times are told for a frame of this size
+FRAME_PIXELS = 640 * 480  # times are reported for a frame of this size
 SETTLED = 1.1  # a start has settled once it is within 10 % of the later mean
 
 
 @dataclass(slots=True)
-class Tally:
+class MetricAccumulator:
     """The figures of one method on one kind of footage."""
 
     frames: list[dict[str, float]] = field(default_factory=list)
@@ -25,10 +25,10 @@ class Tally:
     by_index: dict[int, list[float]] = field(default_factory=dict)  # frame -> EPEs
     cpu_s: float = 0.0
     wall_s: float = 0.0
-    size: float = 0.0  # frames of FRAME_PIXELS
+    size: float = 0.0  # all pixels so far, in frames of FRAME_PIXELS
 
     def add(self, footage: Footage, predictions: Iterator[Prediction]) -> None:
-        before: tuple[View, Prediction] | None = None
+        before: tuple[FootageView, Prediction] | None = None
         for index, view in enumerate(footage.views):
             cpu, wall = time.process_time(), time.perf_counter()
             prediction = next(predictions)
@@ -39,7 +39,7 @@ class Tally:
             self._follow(footage, before, (view, prediction))
             before = view, prediction
 
-    def _judge(self, index: int, view: View, prediction: Prediction) -> None:
+    def _judge(self, index: int, view: FootageView, prediction: Prediction) -> None:
         if view.truth_px is None:
             return
         measures = error_measures(prediction.disparity_px, view.truth_px)
@@ -48,14 +48,14 @@ class Tally:
         self.frames.append(measures)
         self.by_index.setdefault(index, []).append(measures["epe"])
         if prediction.sigma_px is not None:
-            told = calibration(prediction.disparity_px, prediction.sigma_px, view.truth_px)
-            self.calibrations += [told] if told else []
+            calibrated = calibration(prediction.disparity_px, prediction.sigma_px, view.truth_px)
+            self.calibrations += [calibrated] if calibrated else []
 
     def _follow(
         self,
         footage: Footage,
-        before: tuple[View, Prediction] | None,
-        now: tuple[View, Prediction],
+        before: tuple[FootageView, Prediction] | None,
+        now: tuple[FootageView, Prediction],
     ) -> None:
         if before is None:
             return

@@ -15,8 +15,8 @@ from vergence_proto.geometry import Pose, RectifiedRig
 
 Plane = NDArray[np.float32]
 
-MIN_PIXELS = 20  # fewer known pixels say nothing about a frame
-SHARES_PCT = range(10, 100, 10)  # the intervals that sigma is judged by
+MIN_PIXELS = 20  # a frame with fewer known pixels has no figures
+SHARES_PCT = range(10, 100, 10)  # the intervals in which the calibration of sigma is measured
 
 
 def error_measures(predicted_px: Plane, truth_px: Plane) -> dict[str, float] | None:
@@ -42,10 +42,10 @@ def error_measures(predicted_px: Plane, truth_px: Plane) -> dict[str, float] | N
 
 
 def calibration(predicted_px: Plane, sigma_px: Plane, truth_px: Plane) -> dict[str, float] | None:
-    """How far sigma says what the error is.
+    """The calibration of sigma.
 
-    The shares of errors, in percent, within the 10 % to 90 % intervals of a Laplace distribution of
-    scale sigma, and the ratio of the means.
+    Returns the shares of errors, in percent, within the 10 % to 90 % intervals of a Laplace
+    distribution of scale sigma, and the ratio of the means.
     """
     known = np.isfinite(truth_px)
     if known.sum() < MIN_PIXELS:

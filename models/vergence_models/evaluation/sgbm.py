@@ -1,4 +1,4 @@
-"""The classical rival: OpenCV's StereoSGBM, three-way, with its holes filled from the sides."""
+"""The classical baseline: OpenCV's StereoSGBM, three-way, with holes filled from the sides."""
 
 from __future__ import annotations
 

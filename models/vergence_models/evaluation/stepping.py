@@ -1,4 +1,4 @@
-"""Networks stepped over footage: what evaluation, studies, benchmarks and parity checks share."""
+"""Networks stepped over footage, for evaluation, studies, benchmarks and parity checks."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
 from vergence_models.data.clips import StereoClips
-from vergence_proto.datasets import LayoutError, StereoSource
+from vergence_proto.datasets import DatasetError, StereoSource
 from vergence_proto.geometry import Pose, RectifiedRig, uvd_curr_from_prev
 from vergence_proto.model_io import ModelCard, Stages, load_model_card
 
@@ -24,13 +24,13 @@ Plane = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class FootageView:
     """One frame to step, and what is known of its truth."""
 
     left: Image  # [H, W, 3], RGB
     right: Image
     world_from_left: Pose | None
-    truth_px: Plane | None = None  # [H, W], NaN unknown, mirrors left out
+    truth_px: Plane | None = None  # [H, W]; NaN where unknown and on mirrors
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,21 +39,21 @@ class Footage:
 
     name: str
     rig: RectifiedRig
-    views: Sequence[View]
+    views: Sequence[FootageView]
 
 
 def footage_from_source(source: StereoSource) -> Footage:
-    """Read a whole source. Raises LayoutError: it is not rectified, or a file is wrong."""
+    """Read a whole source. Raises DatasetError: it is not rectified, or a file is wrong."""
     rig = source.rig.as_rectified()
     if rig is None:
-        raise LayoutError(f"{source.name}: expected a rectified rig to evaluate on")
+        raise DatasetError(f"{source.name}: expected a rectified rig to evaluate on")
     views = []
     for entry in source:
         truth = entry.truth_px
         if truth is not None and entry.truth_mask is not None:
             truth = np.where(entry.truth_mask, truth, np.float32(np.nan)).astype(np.float32)
         pose = None if entry.frame.pose is None else entry.frame.pose.world_from_left
-        views.append(View(as_rgb(entry.frame.left), as_rgb(entry.frame.right), pose, truth))
+        views.append(FootageView(as_rgb(entry.frame.left), as_rgb(entry.frame.right), pose, truth))
     return Footage(source.name, rig, views)
 
 
@@ -63,7 +63,7 @@ def as_rgb(image: Image) -> Image:
 
 def footage_from_clip(clips: StereoClips, index: int, name: str) -> Footage:
     """One clip of a batch."""
-    frames, _, height, width = clips.left.shape[1:]
+    frames, height, width, _ = clips.left.shape[1:]
     fx, fy, cx, cy, baseline_m = (
         float(getattr(clips, key)[index]) for key in ("fx", "fy", "cx", "cy", "baseline_m")
     )
@@ -72,9 +72,9 @@ def footage_from_clip(clips: StereoClips, index: int, name: str) -> Footage:
     for frame in range(frames):
         truth = clips.disparity_px[index, frame].numpy()
         views.append(
-            View(
-                clips.left[index, frame].permute(1, 2, 0).numpy(),
-                clips.right[index, frame].permute(1, 2, 0).numpy(),
+            FootageView(
+                clips.left[index, frame].numpy(),
+                clips.right[index, frame].numpy(),
                 Pose.from_matrix(clips.world_from_left[index, frame].numpy()),
                 np.where(truth > 0, truth, np.float32(np.nan)),
             )
@@ -85,39 +85,49 @@ def footage_from_clip(clips: StereoClips, index: int, name: str) -> Footage:
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
     disparity_px: Plane  # [H, W]
-    sigma_px: Plane | None = None  # [H, W]; None: the method does not tell
+    sigma_px: Plane | None = None  # [H, W]; None: the method estimates no sigma
 
 
 NO_MOTION = np.eye(4, dtype=np.float32)
-State = tuple[Plane, ...]  # each [1, C, h, w], in the order of the card
+State = tuple[Plane, ...]  # each [B, C, h, w], in the order of the card
+
+
+class StepInputs(NamedTuple):
+    """The inputs of one step of a batch, in the order of the contract."""
+
+    left: Image  # [B, H, W, 3], RGB
+    right: Image  # the same shape
+    uvd_curr_from_prev: NDArray[np.float32]  # [B, 4, 4]
+    state: State
+
+
+class StepResult(NamedTuple):
+    """The outputs of one step of a batch."""
+
+    disparity_px: Plane  # [B, H, W]
+    sigma_px: Plane  # [B, H, W]
+    state: State
 
 
 class SteppedNetwork(ABC):
-    """A network on a card, whatever computes it."""
+    """A network that can be stepped, whichever runtime computes it."""
 
     card: ModelCard
 
     @abstractmethod
-    def run(
-        self,
-        left: Image,
-        right: Image,
-        uvd_curr_from_prev: NDArray[np.float32],
-        state: State,
-        iterations: int,
-    ) -> tuple[Plane, Plane, State]:
-        """One step of a batch: disparity, sigma [B, H, W] and the next state."""
+    def run(self, inputs: StepInputs, iterations: int) -> StepResult:
+        """One step of a batch."""
 
     @abstractmethod
-    def start(self, left: Image, right: Image, iterations: int) -> tuple[Plane, Plane, State]:
-        """As :meth:`run`, of frames that nothing is known before."""
+    def start(self, left: Image, right: Image, iterations: int) -> StepResult:
+        """One step of a batch of first frames, which have no state."""
 
     @abstractmethod
-    def looks_closer(self, iterations: int) -> bool:
-        """Whether :meth:`start` with so many takes the last of them at twice the size."""
+    def refines_at_2x(self, iterations: int) -> bool:
+        """Return True if :meth:`start` runs the last of so many iterations at twice the size."""
 
     def cold_state(self, height: int, width: int, batch: int = 1) -> State:
-        """All zeros, for images of a size that ``card.step_size`` gives."""
+        """All zeros, for images whose size ``card.step_size`` returned."""
         return tuple(
             np.zeros((batch, *tensor.shape(height, width)), np.float32)
             for tensor in self.card.state
@@ -140,7 +150,8 @@ class SteppedNetwork(ABC):
                 if previous is not None and view.world_from_left is not None:
                     curr_from_prev = view.world_from_left.inverse() @ previous
                     matrix = uvd_curr_from_prev(footage.rig, curr_from_prev)
-                disparity, sigma, state = self.run(left, right, matrix[None], state, warm)
+                inputs = StepInputs(left, right, matrix[None], state)
+                disparity, sigma, state = self.run(inputs, warm)
             previous = view.world_from_left
             yield Prediction(disparity[0, :height, :width], sigma[0, :height, :width])
 
@@ -168,28 +179,22 @@ class OnnxNetwork(SteppedNetwork):
         }
         self._beside = ThreadPoolExecutor(min(threads, side_by_side))  # ends with this network
 
-    def run(
-        self,
-        left: Image,
-        right: Image,
-        uvd_curr_from_prev: NDArray[np.float32],
-        state: State,
-        iterations: int,
-    ) -> tuple[Plane, Plane, State]:
-        return self._run(self.card.stages(iterations), left, right, uvd_curr_from_prev, *state)
+    def run(self, inputs: StepInputs, iterations: int) -> StepResult:
+        return self._run(self.card.stages(iterations), inputs)
 
-    def start(self, left: Image, right: Image, iterations: int) -> tuple[Plane, Plane, State]:
+    def start(self, left: Image, right: Image, iterations: int) -> StepResult:
         batch, height, width, _ = left.shape
         still = NO_MOTION[None].repeat(batch, axis=0)
         nothing = self.cold_state(height, width, batch)
         stages = self.card.stages(iterations, cold_pixels=height * width)
-        return self._run(stages, left, right, still, *nothing)
+        return self._run(stages, StepInputs(left, right, still, nothing))
 
-    def looks_closer(self, iterations: int) -> bool:
+    def refines_at_2x(self, iterations: int) -> bool:
         return iterations in self.card.cold_graphs
 
-    def _run(self, stages: Stages, *given: NDArray[np.generic]) -> tuple[Plane, Plane, State]:
-        # Of any type: what one stage hands the next is the exporter's own business.
+    def _run(self, stages: Stages, inputs: StepInputs) -> StepResult:
+        given = (*inputs[:3], *inputs.state)
+        # Any type: the exporter alone decides what one stage passes to the next.
         tensors: dict[str, Any] = dict(zip(self.card.input_names, given, strict=True))
 
         def outputs_of(graph: Path) -> list[tuple[str, Any]]:
@@ -201,4 +206,4 @@ class OnnxNetwork(SteppedNetwork):
         for stage in stages:
             tensors |= chain(*[*self._beside.map(outputs_of, stage)])
         disparity, sigma, *following = (tensors[name] for name in self.card.output_names)
-        return disparity, sigma, tuple(following)
+        return StepResult(disparity, sigma, tuple(following))

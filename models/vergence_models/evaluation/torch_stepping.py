@@ -1,14 +1,14 @@
-"""A training run stepped over footage, where no graph of it was exported."""
+"""A training run stepped over footage by PyTorch, for counts without an exported graph."""
 
 from __future__ import annotations
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from vergence_models.config import load_config
-from vergence_models.evaluation.stepping import Image, Plane, State, SteppedNetwork
+from vergence_models.evaluation.stepping import Image, StepInputs, SteppedNetwork, StepResult
+from vergence_models.networks.base import StepOutput
 from vergence_models.training.runs import Run, trained_network
 from vergence_proto.model_io import ModelCard
 
@@ -30,35 +30,21 @@ class TorchNetwork(SteppedNetwork):
         )
 
     @torch.inference_mode()
-    def run(
-        self,
-        left: Image,
-        right: Image,
-        uvd_curr_from_prev: NDArray[np.float32],
-        state: State,
-        iterations: int,
-    ) -> tuple[Plane, Plane, State]:
-        images = as_tensors(left, right)
-        tensors = tuple(torch.from_numpy(array) for array in state)
-        estimate, following = self._network(
-            *images, torch.from_numpy(uvd_curr_from_prev), tensors, iterations
-        )
-        return (
-            estimate.disparity.numpy(),
-            estimate.sigma.numpy(),
-            tuple(tensor.numpy() for tensor in following),
-        )
+    def run(self, inputs: StepInputs, iterations: int) -> StepResult:
+        state = tuple(torch.from_numpy(array) for array in inputs.state)
+        matrix = torch.from_numpy(inputs.uvd_curr_from_prev)
+        images = as_tensors(inputs.left, inputs.right)
+        estimate, following = self._network(*images, matrix, state, iterations)
+        return as_arrays(StepOutput(estimate.disparity, estimate.sigma, following))
 
     @torch.inference_mode()
-    def start(self, left: Image, right: Image, iterations: int) -> tuple[Plane, Plane, State]:
-        small = left.shape[1] * left.shape[2] <= self._config.closer_max_pixels
-        closer = self._config.closer.get(iterations, 0) if small else 0
-        found = self._network.cold_step(*as_tensors(left, right), iterations, closer=closer)
-        state = tuple(tensor.numpy() for tensor in found.state)
-        return found.disparity.numpy(), found.sigma.numpy(), state
+    def start(self, left: Image, right: Image, iterations: int) -> StepResult:
+        small = left.shape[1] * left.shape[2] <= self._config.max_pixels_at_2x
+        at_2x = self._config.iterations_at_2x.get(iterations, 0) if small else 0
+        return as_arrays(self._network.cold_step(*as_tensors(left, right), iterations, at_2x=at_2x))
 
-    def looks_closer(self, iterations: int) -> bool:
-        return iterations in self._config.closer
+    def refines_at_2x(self, iterations: int) -> bool:
+        return iterations in self._config.iterations_at_2x
 
 
 def as_tensors(left: Image, right: Image) -> tuple[Tensor, Tensor]:
@@ -66,3 +52,8 @@ def as_tensors(left: Image, right: Image) -> tuple[Tensor, Tensor]:
         torch.from_numpy(np.ascontiguousarray(left)),
         torch.from_numpy(np.ascontiguousarray(right)),
     )
+
+
+def as_arrays(output: StepOutput) -> StepResult:
+    state = tuple(tensor.numpy() for tensor in output.state)
+    return StepResult(output.disparity.numpy(), output.sigma.numpy(), state)

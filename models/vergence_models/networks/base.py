@@ -1,7 +1,7 @@
-"""What every tier's network is: one step of the recurrence, from two images and a state to both.
+"""The interface of every network: one step of the recurrence, from images and state to disparity.
 
-The tiers differ in what they compute and in what they remember, never in how they are called; so
-training, validation, export and parity checks know this module alone.
+The tiers differ in their computation and in their state, but all are called alike. So training,
+validation, export and parity checks import this module alone.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from vergence_models.config import NetworkConfig
 from vergence_proto.model_io import StateTensor
 
-# What one step hands to the next, float32 [B, C, H/s, W/s] each, as ``state_tensors`` tells; all
-# zeros is a cold start. A tier may name its parts in a NamedTuple of its own.
+# The recurrent state, float32 [B, C, H/s, W/s] each, as ``state_tensors`` describes them. All
+# zeros is a cold start. A tier may name its tensors in a NamedTuple of its own.
 State: TypeAlias = tuple[Tensor, ...]
 
 ConfigT = TypeVar("ConfigT", bound=NetworkConfig, covariant=True)
@@ -25,7 +25,7 @@ ConfigT = TypeVar("ConfigT", bound=NetworkConfig, covariant=True)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate(ABC):
-    """What one step answers; a tier adds the inner estimates that its training supervises too."""
+    """The result of one step; a tier adds the inner estimates that its training supervises too."""
 
     disparity: Tensor  # float32 [B, H, W], px > 0
     sigma: Tensor  # float32 [B, H, W], px: half of the errors lie within sigma ln 2
@@ -35,8 +35,8 @@ class Estimate(ABC):
         """The loss of this step against ``truth_px`` [B, H, W] (0 = unknown), a scalar."""
 
 
-class Found(NamedTuple):
-    """What a step gives to whoever has no use for more: the outputs of an exported graph."""
+class StepOutput(NamedTuple):
+    """The result of a step without inner estimates: the outputs of an exported graph."""
 
     disparity: Tensor  # float32 [B, H, W], px
     sigma: Tensor  # likewise
@@ -66,24 +66,28 @@ class StereoNetwork(nn.Module, ABC, Generic[ConfigT]):
     ) -> tuple[Estimate, State]:
         """One step. ``left`` and ``right`` uint8 [B, H, W, 3]; H and W multiples of the stride."""
 
-    def cold_step(self, left: Tensor, right: Tensor, iterations: int, *, closer: int = 0) -> Found:
-        """A step that knows of no frame before, the last ``closer`` iterations at twice the size.
+    def cold_step(
+        self, left: Tensor, right: Tensor, iterations: int, *, at_2x: int = 0
+    ) -> StepOutput:
+        """A step without a previous frame; the last ``at_2x`` iterations run at twice the size.
 
-        Raises ValueError if the tier takes no closer look and is asked for one.
+        Raises ValueError if ``at_2x`` is not 0 and the tier has no 2x refinement.
         """
         batch, height, width, _ = left.shape
         still = torch.eye(4, device=left.device).repeat(batch, 1, 1)
         nothing = self.cold_state(batch, height, width)
-        estimate, state = self(left, right, still, nothing, iterations - closer)
-        found = Found(estimate.disparity, estimate.sigma, state)
-        return self.closer_look(left, right, found, closer) if closer else found
+        estimate, state = self(left, right, still, nothing, iterations - at_2x)
+        found = StepOutput(estimate.disparity, estimate.sigma, state)
+        return self.refine_at_2x(left, right, found, at_2x) if at_2x else found
 
-    def closer_look(self, left: Tensor, right: Tensor, found: Found, iterations: int) -> Found:
-        """What more iterations at twice the size make of what was ``found`` in a step's images."""
-        raise ValueError(f"{type(self).__name__} takes no closer look, got {iterations} iterations")
+    def refine_at_2x(
+        self, left: Tensor, right: Tensor, found: StepOutput, iterations: int
+    ) -> StepOutput:
+        """Refine the output of a step by more iterations on images of twice the size."""
+        raise ValueError(f"{type(self).__name__} cannot refine at 2x, got {iterations} iterations")
 
     def cold_state(self, batch: int, height: int, width: int) -> State:
-        """The state that knows nothing, for images of that size, where the weights are."""
+        """The state of a cold start, for images of that size, on the device of the weights."""
         device = next(self.parameters()).device
         return tuple(
             torch.zeros(batch, *tensor.shape(height, width), device=device)

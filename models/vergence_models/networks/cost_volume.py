@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-BLOCKS = 8  # of columns: images are as wide as multiples of 32, so cells of 1/4 divide into them
+BLOCKS = 8  # blocks of columns: widths are multiples of 32, so cells of 1/4 divide into them
 
 
 class Volume(NamedTuple):
@@ -37,9 +37,10 @@ def whole_rows(scores: Tensor) -> Volume:
 
 
 class Near(NamedTuple):
-    """Which right entries a left cell meets: those up to ``reach`` to the left of its own.
+    """The right entries that a left cell is matched with: up to ``reach`` to the left of its own.
 
-    And ``margin`` on either side of these, and some more: a block of columns shares its window.
+    The window extends by ``margin`` on either side, and by a little more, since all cells of a
+    block of columns share one window.
     """
 
     ratio: int  # right entries per left cell
@@ -66,7 +67,7 @@ class Near(NamedTuple):
         start = torch.arange(BLOCKS, device=left.device) * block - self.before
         cells = torch.arange(self.before + block + self.after, device=left.device)
         cells = (cells + start[:, None]).clamp(0, width - 1)
-        # Of the mean the division first: what follows then only copies, which bytes can be.
+        # The mean's division comes first: all operators after it copy, which works on bytes too.
         left_rows = (left * (1 / channels)).permute(0, 2, 1, 3)
         left_rows = left_rows.reshape(batch, height, channels, BLOCKS, block).transpose(2, 3)
         right_rows = right.permute(0, 2, 3, 1).reshape(batch, height, width, ratio * channels)
@@ -76,7 +77,7 @@ class Near(NamedTuple):
         return torch.matmul(right_rows, left_rows)
 
     def volume(self, pairs: Tensor) -> Volume:
-        """Of what :meth:`pairs` gave."""
+        """A volume from the result of :meth:`pairs`."""
         count, block = pairs.shape[3:]
         blocks = torch.arange(BLOCKS, device=pairs.device)[:, None]
         within = torch.arange(block, device=pairs.device)
@@ -89,8 +90,8 @@ class Near(NamedTuple):
 def lookup(volume: Volume, position: Tensor) -> Tensor:
     """Linear interpolation at ``position`` [B, K, H, W], in entries; the result is of that shape.
 
-    No gradient flows to the position: a disparity learns from its own loss, not from wishing to
-    have been looked up elsewhere, which would blow up over iterations and frames.
+    No gradient flows to the position: a disparity learns from its own loss. A gradient through
+    the lookup would blow up over iterations and frames.
     """
     position = position.detach()
     low = torch.floor(position)
@@ -120,7 +121,7 @@ def gathered(volume: Volume, entry: Tensor) -> Tensor:
     # Row by row, so that a row is still in the cache when its next entry is read.
     by_row = (entry.transpose(1, 2) - volume.first).clamp(0, volume.window - 1)
     by_row = by_row * volume.stride + volume.begin
-    # Of single entries onnxruntime's gather of elements is four times as quick as that of slices.
+    # For single entries onnxruntime's GatherElements is four times as fast as its Gather of slices.
     rows = volume.scores.reshape(batch * height, -1)
     found = rows.gather(1, by_row.long().reshape(batch * height, -1))
     return found.view(by_row.shape).transpose(1, 2)

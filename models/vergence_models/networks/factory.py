@@ -1,4 +1,4 @@
-"""From a configuration to its network: the one place that knows every architecture."""
+"""Builds the network of a configuration; the only module that imports every architecture."""
 
 from __future__ import annotations
 

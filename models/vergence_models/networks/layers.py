@@ -1,9 +1,9 @@
-"""The parts of the network: census descriptors, volumes, the cell, the upsampler.
+"""Layers of the networks: census descriptors, volumes, the recurrent cell, the upsampler.
 
-Each is written the way onnxruntime runs it fast on a CPU: matrix products and gathers along the
-last axis, exp and sum instead of Softmax, slices instead of unfold, no norm layers. And each starts
-from what classical stereo knows, with the learned part at zero, so that an untrained network
-already matches.
+Each is written so that onnxruntime runs it fast on a CPU: matrix products and gathers along the
+last axis, exp and sum instead of Softmax, slices instead of unfold, no norm layers. Each starts as
+a method of classical stereo, with the learned part at zero, so an untrained network already
+matches.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ def joint(layer: nn.Conv2d, *parts: Tensor) -> Tensor:
 
 
 def silent(layer: nn.Conv2d) -> nn.Conv2d:
-    """The same layer with zero output: what it adds has to be learned."""
+    """The same layer with zero weights: its contribution starts at zero."""
     nn.init.zeros_(layer.weight)
     return layer
 

@@ -1,4 +1,4 @@
-"""What a step is trained for: disparity everywhere, and its own error."""
+"""The losses of a step: its disparity everywhere, and sigma, its own error."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ def lookup_cross_entropy(scores: Tensor, position: Tensor, mask: Tensor) -> Tens
 
 
 def doubt_loss(error_px: Tensor, sigma_px: Tensor) -> Tensor:
-    """Least where half of the errors lie within sigma ln 2, as with a Laplace distribution.
+    """A loss that is least where half of the errors lie within sigma ln 2 (Laplace distribution).
 
-    A difference of logarithms, so that it is the median that counts: the likelihood would let the
-    few wild errors widen the sigma of everything around them.
+    It is a difference of logarithms, so the median counts. With the likelihood a few very large
+    errors would widen the sigma of everything around them.
     """
     floor_px = 0.02
     return (torch.log(error_px + floor_px) - torch.log(sigma_px * math.log(2) + floor_px)).abs()
@@ -56,7 +56,7 @@ def doubt_loss(error_px: Tensor, sigma_px: Tensor) -> Tensor:
 def output_loss(
     disparity: Tensor, sigma: Tensor, truth_px: Tensor, max_disparity_px: int
 ) -> Tensor:
-    """The loss of an answer against ``truth_px``, all [B, H, W]; 0 = unknown truth."""
+    """The loss of disparity and sigma against ``truth_px``, all [B, H, W]; 0 = unknown truth."""
     mask = known(truth_px, max_disparity_px)
     error = (disparity - truth_px).abs()
     # Sigma learns from the error, and must not buy itself a better one.

@@ -1,7 +1,7 @@
-"""Moving the state of the previous frame to the view of the current one.
+"""Warping of the state of the previous frame to the view of the current one.
 
-Everything happens in (u, v, d, 1): pixels and disparity of the left image, at full resolution,
-pixel centres at integers. A 4x4 matrix takes the previous frame's to the current frame's.
+All points are (u, v, d, 1): pixels and disparity of the left image, at full resolution, with pixel
+centres at integers. A 4x4 matrix takes points of the previous frame to the current frame.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-MIN_DISPARITY_PX = 0.05  # smaller ones are no surface a stereo camera can place
+MIN_DISPARITY_PX = 0.05  # a stereo camera cannot place surfaces of smaller disparity
 SPLAT_SHARPNESS = 1.0  # 1/px: a surface nearer by 3 px has 20 times the weight
 
 
@@ -92,9 +92,9 @@ def sample_bilinear(plane: Tensor, column: Tensor, row: Tensor) -> Tensor:
 
 
 def sample_nearest(features: Tensor, column: Tensor, row: Tensor) -> Tensor:
-    """Those of ``features`` [B, C, H, W] nearest to float cells [B, H', W'], clamped.
+    """Samples of ``features`` [B, C, H, W] nearest to float cells [B, H', W'], clamped.
 
-    The channels of a cell side by side, so that each is one copy.
+    The channels of a cell lie side by side, so that each cell is one copy.
     """
     batch, channels, height, width = features.shape
     x = torch.floor(column + 0.5).clamp(0, width - 1)

@@ -1,7 +1,7 @@
-"""Int8 graphs of a tier: ranges and rounding found on some clips, the loss measured on others.
+"""Int8 graphs of a tier: ranges and rounding from some clips, the loss measured on others.
 
-The clips are synthetic, of the kind that validation uses. Each graph steps through them with its
-own state, so that the ranges are those of recurrent use.
+The clips are synthetic, like those of validation. Each graph steps through them with its own state,
+so the ranges are those of recurrent use.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ import onnxruntime
 from numpy.typing import NDArray
 from onnx import ModelProto, TensorProto, helper
 
-from vergence_models.config import Kind
+from vergence_models.config import StepKind
 from vergence_models.data.clips import StereoClips
 from vergence_models.data.pool import ClipPool
 from vergence_models.onnx_export.pair_sums import overflowing
-from vergence_models.onnx_export.quantization_plan import plan
-from vergence_models.onnx_export.quantize import Scale, copy_of, quantized, with_weights_apart
+from vergence_models.onnx_export.quantization_plan import plan_quantization
+from vergence_models.onnx_export.quantize import ByteScale, copy_of, quantized, with_weights_apart
 from vergence_models.onnx_export.rounding import inputs_of
-from vergence_models.training.motion import uvd_transforms
+from vergence_models.training.camera_motion import uvd_transforms
 from vergence_models.training.validation import filmed
 from vergence_proto.model_io import DISPARITY, LEFT, RIGHT, UVD_CURR_FROM_PREV, StateTensor
 
 Array = NDArray[np.generic]
 
 RANGE_CLIPS = 4
-MEASURED_CLIPS = 16  # those that follow
+MEASURED_CLIPS = 16  # the clips after those
 BATCH = 4
 # A byte's step in the features moves 99 of 100 pixels by less than this. Where two hypotheses are
 # equally good it may tip the choice, as the order of sums does in float32.
@@ -36,28 +36,28 @@ MAX_LOSS = 1.03  # EPE of the int8 graph over that of the float one
 
 
 class QuantizationError(RuntimeError):
-    """An int8 graph loses too much, or computes something else on another CPU."""
+    """An int8 graph loses too much accuracy, or would differ on another CPU."""
 
 
 def make_int8(
-    models: Mapping[Kind, ModelProto],
+    models: Mapping[StepKind, ModelProto],
     states: Sequence[StateTensor],
     pool: ClipPool,
     *,
     max_disparity_px: float,
-) -> tuple[dict[Kind, ModelProto], dict[str, object]]:
-    """Int8 graphs of float ones, and the story for the manifest.
+) -> tuple[dict[StepKind, ModelProto], dict[str, object]]:
+    """Int8 graphs of float graphs, and their entry of the manifest.
 
     Raises QuantizationError if the smallest loses more than :data:`MAX_LOSS`, or if a product in
     any of them may overflow 16 bits.
     """
     clips = filmed(pool, range(RANGE_CLIPS))
-    made: dict[Kind, ModelProto] = {}
+    made: dict[StepKind, ModelProto] = {}
     story: dict[str, object] = {}
     for kind, whole in sorted(models.items()):
         model = with_weights_apart(whole)
-        what = plan(model)
-        cold = kind.closer > 0
+        what = plan_quantization(model)
+        cold = kind.at_2x > 0
         seen = steps(model, states, clips, what.measured, forget=cold)
         scales = scales_of(seen, what.measured)
         convolutions = [each for each in model.graph.node if each.output[0] in what.convolutions]
@@ -93,7 +93,7 @@ def steps(
     *,
     forget: bool = False,
 ) -> Iterator[dict[str, Array]]:
-    """Step a graph through clips: after every frame the named tensors.
+    """Step a graph through clips and yield the named tensors after every frame.
 
     The first frame starts cold, with ``forget`` every frame.
     """
@@ -109,13 +109,10 @@ def steps(
     )
     wanted = [*names, *(tensor.output_name for tensor in states)]
     matrices = uvd_transforms(clips, clips.world_from_left).numpy()
-    batch, frames, _, height, width = clips.left.shape
+    batch, frames, height, width, _ = clips.left.shape
     state = {t.input_name: np.zeros((batch, *t.shape(height, width)), np.float32) for t in states}
     for frame in range(frames):
-        left, right = (
-            eye[:, frame].permute(0, 2, 3, 1).contiguous().numpy()
-            for eye in (clips.left, clips.right)
-        )
+        left, right = (image.numpy() for image in clips.pair(frame))
         images = {LEFT: left, RIGHT: right, UVD_CURR_FROM_PREV: matrices[:, frame]}
         found = session.run(wanted, {**images, **state})
         yield dict(zip(names, found, strict=False))
@@ -127,14 +124,14 @@ def steps(
         }
 
 
-def scales_of(seen: Iterable[Mapping[str, Array]], names: Sequence[str]) -> dict[str, Scale]:
-    """For each tensor the scale that covers all that it holds."""
+def scales_of(seen: Iterable[Mapping[str, Array]], names: Sequence[str]) -> dict[str, ByteScale]:
+    """The scale of each tensor that covers all values seen."""
     low, high = dict.fromkeys(names, 0.0), dict.fromkeys(names, 0.0)
     for found in seen:
         for name, values in found.items():
             low[name] = min(low[name], float(values.min()))
             high[name] = max(high[name], float(values.max()))
-    return {name: Scale.of_range(low[name], high[name]) for name in names}
+    return {name: ByteScale.of_range(low[name], high[name]) for name in names}
 
 
 def epe_px(

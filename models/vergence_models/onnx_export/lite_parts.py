@@ -1,36 +1,34 @@
-"""The step of `lite` in the parts that its graphs are stitched from."""
+"""The parts of a step of `lite`, from which its graphs are stitched."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from vergence_models.networks.base import Found
-from vergence_models.networks.lite.coarse import Clues
-from vergence_models.networks.lite.network import Evidence, LiteNetwork, LiteState
+from vergence_models.networks.base import StepOutput
+from vergence_models.networks.lite.coarse import CostFeatures
+from vergence_models.networks.lite.network import LiteNetwork, LiteState, MatchingFeatures
 from vergence_models.networks.lite.refinement import Refined
 from vergence_models.networks.lite.upscaled import joined, larger_image, larger_state
 from vergence_models.onnx_export.modules import (
     BATCH,
     COLUMNS,
     ROWS,
-    Part,
-    PartOf,
+    GraphPart,
     Sizes,
+    StepContract,
+    StepModule,
     cells,
-    step_input_names,
-    step_inputs,
-    step_output_names,
 )
-from vergence_models.onnx_export.stitch import PLAIN, TAKES_PLACE, CloserLook, Parts
+from vergence_models.onnx_export.stitch import PLAIN, TAKES_PLACE, RefinementAt2x, StepParts
 from vergence_proto.model_io import LEFT, RIGHT
 
 NARROW = ("pairs", "context4", "context8", "context16")
-GIVEN = (*Clues._fields, *NARROW)
+GIVEN = (*CostFeatures._fields, *NARROW)
 
 
-class Wide(PartOf[LiteNetwork]):
-    """The wide search, and the state moved to the new view."""
+class Wide(StepModule[LiteNetwork]):
+    """The inputs of the wide search, and the state warped to the new view."""
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         left, right, matrix, *state = inputs
@@ -38,50 +36,51 @@ class Wide(PartOf[LiteNetwork]):
         return *self.network.search_wide(left, right), *moved
 
 
-class Narrow(PartOf[LiteNetwork]):
-    """The narrow search's volume, and the context. It takes about as long as the other."""
+class Narrow(StepModule[LiteNetwork]):
+    """The volume of the narrow search, and the context. It takes about as long as the wide part."""
 
     def forward(self, *images: Tensor) -> tuple[Tensor, ...]:
         left, right = images
         return self.network.search_narrow(left, right)
 
 
-class Iterate(PartOf[LiteNetwork]):
+class Iterate(StepModule[LiteNetwork]):
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         fixed, features, *narrow = inputs[: len(GIVEN)]
-        evidence = Evidence(Clues(fixed, features), *narrow)
+        evidence = MatchingFeatures(CostFeatures(fixed, features), *narrow)
         found = self.network.iterate(evidence, LiteState(*inputs[len(GIVEN) :]))
         disparity, doubt, features = found.answer
         return disparity, found.hidden, doubt, features
 
 
-class End(PartOf[LiteNetwork]):
+class End(StepModule[LiteNetwork]):
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         disparity, hidden, doubt, features = inputs
         refined = Refined(disparity, doubt, features)
         return *self.network.refinement.enlarged(refined), disparity, hidden
 
 
-class Enter(PartOf[LiteNetwork]):
+class Enter(StepModule[LiteNetwork]):
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         left, right, *state = inputs
         return larger_image(left), larger_image(right), *larger_state(*state)
 
 
-class Join(PartOf[LiteNetwork]):
+class Join(StepModule[LiteNetwork]):
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        plain, closer = (
-            Found(disparity, sigma, tuple(state))
+        plain, at_2x = (
+            StepOutput(disparity, sigma, tuple(state))
             for disparity, sigma, *state in (inputs[:4], inputs[4:])
         )
-        disparity, sigma, state = joined(plain, closer, self.network.config.max_disparity_px)
+        disparity, sigma, state = joined(plain, at_2x, self.network.config.max_disparity_px)
         return disparity, sigma, *state
 
 
-def parts_of(network: LiteNetwork) -> Parts[Part]:
-    """Both searches, one iteration, and the way to full size."""
+def parts_of(network: LiteNetwork) -> StepParts[GraphPart]:
+    """The parts: both searches, one iteration, and the upsampling to full size."""
     stride = network.config.stride
-    inputs, sizes = step_inputs(network)
+    contract = StepContract.of(network)
+    inputs, sizes = contract.inputs, contract.sizes
     columns = network.near
     window = columns.ratio * COLUMNS + columns.ratio * (columns.before + columns.after)
     moving = tuple(f"at_{name}" for name in LiteState._fields)  # outputs have the plain names
@@ -96,46 +95,47 @@ def parts_of(network: LiteNetwork) -> Parts[Part]:
         "at_hidden": cells(stride, 8),
     }
     wide, narrow = Wide(network), Narrow(network)
-    clues = wide.examples(*inputs)
+    cost_features = wide.examples(*inputs)
     found = narrow.examples(*inputs[:2])
-    between = (*clues[:2], *found, *clues[2:])
+    between = (*cost_features[:2], *found, *cost_features[2:])
     iterate = Iterate(network)
     answer = iterate.examples(*between)
-    return Parts(
+    return StepParts(
         begin=(
-            Part(wide, inputs, sizes, step_input_names(network), (*Clues._fields, *moving)),
-            Part(narrow, inputs[:2], sizes[:2], (LEFT, RIGHT), NARROW),
+            GraphPart(wide, inputs, sizes, contract.input_names, (*CostFeatures._fields, *moving)),
+            GraphPart(narrow, inputs[:2], sizes[:2], (LEFT, RIGHT), NARROW),
         ),
-        iterate=Part(
+        iterate=GraphPart(
             iterate,
             between,
             tuple(sizes_of[name] for name in (*GIVEN, *moving)),
             (*GIVEN, *moving),
             tuple(TAKES_PLACE + name for name in (*moving, "doubt", "features4")),
         ),
-        end=Part(
+        end=GraphPart(
             End(network),
             answer,
             tuple(cells(stride, scale) for scale in (4, 8, 4, 4)),
             (*moving, "doubt", "features4"),
-            step_output_names(network),
+            contract.output_names,
         ),
-        closer=closer_look(network),
+        at_2x=refine_at_2x(network),
     )
 
 
-def closer_look(network: LiteNetwork) -> CloserLook[Part]:
-    """The way to twice the size and back."""
-    (left, right, _, *state), (image, *_) = step_inputs(network)
-    given, outputs = step_input_names(network), step_output_names(network)
+def refine_at_2x(network: LiteNetwork) -> RefinementAt2x[GraphPart]:
+    """The parts that go to twice the size and back."""
+    contract = StepContract.of(network)
+    (left, right, _, *state), (image, *_) = contract.inputs, contract.sizes
+    given, outputs = contract.input_names, contract.output_names
     enter, (height, width) = Enter(network), left.shape[1:3]
     larger = enter.examples(left, right, *state)
     maps = [torch.zeros(2, height, width) for _ in range(2)]
     larger_maps = [torch.zeros(2, 2 * height, 2 * width) for _ in range(2)]
     stride = network.config.stride
     sizes, larger_sizes = (found_sizes(rows) for rows in (stride, 2 * stride))
-    return CloserLook(
-        enter=Part(
+    return RefinementAt2x(
+        enter=GraphPart(
             enter,
             (left, right, *state),
             (image, image, *sizes[2:]),
@@ -143,7 +143,7 @@ def closer_look(network: LiteNetwork) -> CloserLook[Part]:
             tuple(TAKES_PLACE + name for name in (LEFT, RIGHT, *given[3:])),
         ),
         moved=dict(zip(given[3:], (f"at_{name}" for name in LiteState._fields), strict=True)),
-        join=Part(
+        join=GraphPart(
             Join(network),
             (*maps, *state, *larger_maps, *larger[2:]),
             (*sizes, *larger_sizes),
@@ -154,6 +154,6 @@ def closer_look(network: LiteNetwork) -> CloserLook[Part]:
 
 
 def found_sizes(stride: int) -> tuple[Sizes, ...]:
-    """Of what a step finds in images that are multiples of ``stride``."""
+    """Sizes of a step's outputs, for images that are multiples of ``stride``."""
     plane: Sizes = {0: BATCH, 1: stride * ROWS, 2: stride * COLUMNS}
     return plane, plane, cells(stride, 4), cells(stride, 8)

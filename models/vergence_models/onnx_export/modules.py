@@ -1,4 +1,4 @@
-"""From modules to ONNX graphs: parts of a step, to be stitched."""
+"""Export of modules, each a part of a step, to ONNX graphs that can be stitched."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ Sizes = dict[int, object]
 Network = TypeVar("Network", bound=nn.Module)
 
 
-class PartOf(nn.Module, Generic[Network]):
-    """A part of a network's step, from tensors to tensors: ``forward`` is what remains to say."""
+class StepModule(nn.Module, Generic[Network]):
+    """A part of a network's step, from tensors to tensors; subclasses define ``forward``."""
 
     def __init__(self, network: Network) -> None:
         super().__init__()
         self.network = network
 
     def examples(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """What it gives, for the part that takes it."""
+        """Example outputs, which are example inputs of the next part."""
         return tuple(tensor.detach() for tensor in self(*inputs))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Part:
-    """A module to export, and what goes in and out of it: tensors alone, by name."""
+class GraphPart:
+    """A module to export, with its inputs and outputs: tensors alone, by name."""
 
     module: nn.Module
-    inputs: tuple[Tensor, ...]  # examples
-    sizes: tuple[Sizes, ...]  # of the inputs
+    inputs: tuple[Tensor, ...]  # example inputs
+    sizes: tuple[Sizes, ...]  # the varying dimensions of each input
     input_names: tuple[str, ...]
     output_names: tuple[str, ...]
 
@@ -55,30 +55,33 @@ def cells(stride: int, scale: int) -> Sizes:
     return {0: BATCH, 2: stride // scale * ROWS, 3: stride // scale * COLUMNS}
 
 
-def step_inputs(network: AnyNetwork) -> tuple[tuple[Tensor, ...], tuple[Sizes, ...]]:
-    """Examples of the contract's inputs, and how their sizes vary."""
-    stride = network.config.stride
-    height, width = 6 * stride, 8 * stride
-    # Two tensors: the exporter would take one object for one input, and match left with left.
-    left, right = (torch.zeros(2, height, width, 3, dtype=torch.uint8) for _ in range(2))
-    state = network.cold_state(2, height, width)
-    image: Sizes = {0: BATCH, 1: stride * ROWS, 2: stride * COLUMNS}
-    state_sizes = (cells(stride, tensor.scale) for tensor in network.state_tensors)
-    return (
-        (left, right, torch.eye(4).repeat(2, 1, 1), *state),
-        (image, image, {0: BATCH}, *state_sizes),
-    )
+@dataclass(frozen=True, slots=True, eq=False)
+class StepContract:
+    """The inputs and outputs of a whole step, as the manifest's readers know them."""
+
+    inputs: tuple[Tensor, ...]  # examples: both images, the motion, the state
+    sizes: tuple[Sizes, ...]  # the varying dimensions of each input
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+
+    @classmethod
+    def of(cls, network: AnyNetwork) -> StepContract:
+        stride = network.config.stride
+        height, width = 6 * stride, 8 * stride
+        # Two tensors: the exporter would take one object for one input, and match left with left.
+        left, right = (torch.zeros(2, height, width, 3, dtype=torch.uint8) for _ in range(2))
+        state = network.cold_state(2, height, width)
+        image: Sizes = {0: BATCH, 1: stride * ROWS, 2: stride * COLUMNS}
+        tensors = network.state_tensors
+        return cls(
+            (left, right, torch.eye(4).repeat(2, 1, 1), *state),
+            (image, image, {0: BATCH}, *(cells(stride, tensor.scale) for tensor in tensors)),
+            (LEFT, RIGHT, UVD_CURR_FROM_PREV, *(tensor.input_name for tensor in tensors)),
+            (DISPARITY, SIGMA, *(tensor.output_name for tensor in tensors)),
+        )
 
 
-def step_input_names(network: AnyNetwork) -> tuple[str, ...]:
-    return (LEFT, RIGHT, UVD_CURR_FROM_PREV, *(t.input_name for t in network.state_tensors))
-
-
-def step_output_names(network: AnyNetwork) -> tuple[str, ...]:
-    return (DISPARITY, SIGMA, *(tensor.output_name for tensor in network.state_tensors))
-
-
-def export_part(part: Part, path: Path) -> None:
+def export_part(part: GraphPart, path: Path) -> None:
     """Write a part's graph, with dynamic batch, height and width."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the exporter's own deprecations
@@ -98,7 +101,7 @@ def export_part(part: Part, path: Path) -> None:
 
 
 def join_clamps(model: onnx.ModelProto) -> None:
-    """Make one operator of a clamp to a size, which the exporter writes as a Max and a Min."""
+    """Make one Clip of a clamp, which the exporter writes as a Max and a Min."""
     graph = model.graph
     scalars = {tensor.name for tensor in graph.initializer if not tensor.dims}
     scalars |= {value.name for value in graph.value_info if is_scalar(value)}
@@ -123,7 +126,7 @@ def is_scalar(value: onnx.ValueInfoProto) -> bool:
 
 
 def slim(path: Path) -> None:
-    """Drop what the exporter notes: stack traces, file paths, and sizes in an order of chance."""
+    """Drop the exporter's notes: stack traces, file paths, and sizes in a random order."""
     model = onnx.load(path)
     join_clamps(model)
     for node in model.graph.node:
@@ -135,7 +138,7 @@ def slim(path: Path) -> None:
 
 
 def folded(network: Network) -> Network:
-    """A copy that computes the same with every batch norm folded into its convolution."""
+    """A copy with the same results, where every batch norm is folded into its convolution."""
     network = copy.deepcopy(network).eval()
     for module in network.modules():
         if not isinstance(module, nn.Sequential):

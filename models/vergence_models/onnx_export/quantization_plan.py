@@ -1,8 +1,8 @@
-"""What of an exported graph becomes bytes: its convolutions of features, and what they meet.
+"""The choice of tensors of an exported graph that become bytes.
 
-Sums of what convolutions gave are bytes too, and so is a product of features that is only looked up
-in: of the millions of its scores few are ever read. Images are bytes from the start. All else stays
-float32, so positions and disparities lose nothing.
+These are convolutions of features with their inputs and outputs, sums of such outputs, and products
+of features that are only looked up in: of their millions of scores few are ever read. Images are
+bytes from the start. Everything else stays float32, so positions and disparities lose nothing.
 """
 
 from __future__ import annotations
@@ -11,26 +11,26 @@ from dataclasses import dataclass
 
 from onnx import ModelProto, NodeProto, TensorProto
 
-# What passes its values on unchanged, and their scale with them.
+# Operators that pass on their values, and so their scale, unchanged.
 COPYING_OPS = frozenset(
     {"Gather", "GatherElements", "Reshape", "Squeeze", "Transpose", "Unsqueeze"}
 )
 LAYOUT_OPS = COPYING_OPS | {"Resize"}
-# What bytes that start at 0 do by themselves. A clip's upper end is then the range's.
+# Bytes that start at 0 include these operators. A clip's upper end becomes that of the range.
 ACTIVATIONS = frozenset({"Relu", "Clip"})
 # A convolution of a gray image would gain little: its differences are what matching starts from.
 MIN_CHANNELS = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Plan:
-    """Which convolutions of a graph become int8, and which tensors bytes."""
+class QuantizationPlan:
+    """The convolutions of a graph that become int8, and the tensors that become bytes."""
 
-    convolutions: frozenset[str]  # by the tensor that they give
-    products: frozenset[str]  # likewise, of matrices
-    images: dict[str, str]  # real image -> the bytes that it is
-    source: dict[str, str]  # tensor -> the tensor that it has its scale from, itself mostly
-    absorbed: dict[str, str]  # result of an activation -> what goes into it
+    convolutions: frozenset[str]  # names of the convolutions' output tensors
+    products: frozenset[str]  # names of the matrix products' output tensors
+    images: dict[str, str]  # image as floats -> the same image as bytes
+    source: dict[str, str]  # tensor -> the tensor whose scale it shares, mostly itself
+    absorbed: dict[str, str]  # output of an activation -> its input
 
     @property
     def measured(self) -> list[str]:
@@ -38,8 +38,8 @@ class Plan:
         return sorted(set(self.source.values()) - set(self.images))
 
 
-def plan(model: ModelProto) -> Plan:
-    """What to quantise: convolutions of features, what goes in and out of them, and its sums."""
+def plan_quantization(model: ModelProto) -> QuantizationPlan:
+    """Choose the convolutions of features, their inputs and outputs, and sums of these."""
     constants = {tensor.name: tensor for tensor in model.graph.initializer}
     readers: dict[str, list[NodeProto]] = {}
     for node in model.graph.node:
@@ -49,7 +49,7 @@ def plan(model: ModelProto) -> Plan:
     absorbed: dict[str, str] = {}
 
     def give_bytes(result: str) -> None:
-        """Behind an activation that alone reads it, if there is one."""
+        """Make a result bytes, after its activation if that is its only reader."""
         following = readers.get(result, [])
         if len(following) == 1 and following[0].op_type in ACTIVATIONS:
             absorbed[following[0].output[0]] = result
@@ -92,7 +92,7 @@ def plan(model: ModelProto) -> Plan:
             images[result] = node.input[0]
         elif node.op_type == "Cast" and casts_to_bytes(node):
             of_bytes.add(result)
-    # What is copied or put together for such an operator alone is so as bytes.
+    # A tensor that only such an operator reads is copied or concatenated as bytes.
     made_by = {name: node for node in model.graph.node for name in node.output}
     for node in reversed(model.graph.node):
         whole, result = node.input[0] if node.input else "", node.output[0]
@@ -100,7 +100,7 @@ def plan(model: ModelProto) -> Plan:
             continue
         if node.op_type in COPYING_OPS or (whole in made_by and made_by[whole].op_type == "Concat"):
             source.setdefault(whole, source[result])
-    return Plan(frozenset(convolutions), frozenset(products), images, source, absorbed)
+    return QuantizationPlan(frozenset(convolutions), frozenset(products), images, source, absorbed)
 
 
 def casts_to_bytes(node: NodeProto) -> bool:

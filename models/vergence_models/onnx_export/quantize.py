@@ -1,7 +1,7 @@
-"""Int8 convolutions for an exported graph (QDQ), where its plan wants bytes.
+"""Int8 convolutions for an exported graph (QDQ), where its plan chooses bytes.
 
-Activations are uint8; weights are int8, symmetric, with a scale per output channel: for this pair
-onnxruntime has its quickest kernels, three to four times as quick as float32. Images are bytes from
+Activations are uint8; weights are int8, symmetric, with a scale per output channel. For this pair
+onnxruntime has its fastest kernels, three to four times as fast as float32. Images are bytes from
 the start. All sums are exact on every CPU (:mod:`vergence_models.onnx_export.pair_sums`).
 """
 
@@ -15,25 +15,25 @@ from numpy.typing import NDArray
 from onnx import ModelProto, NodeProto, TensorProto, helper, numpy_helper
 
 from vergence_models.onnx_export.pair_sums import finest_steps, in_safe_parts
-from vergence_models.onnx_export.quantization_plan import COPYING_OPS, Plan
-from vergence_models.onnx_export.rounding import Inputs, rounded
+from vergence_models.onnx_export.quantization_plan import COPYING_OPS, QuantizationPlan
+from vergence_models.onnx_export.rounding import PatchStatistics, rounded
 
 Array = NDArray[np.generic]
 
-# The quick kernel makes no fewer outputs; what was not asked for is cut off.
+# The fast kernel computes at least so many outputs; those not needed are cut off.
 KERNEL_OUTPUTS = 16
-BYTES = ".bytes"  # behind a tensor's name: the same as bytes
+BYTES = ".bytes"  # suffix of a tensor's name: the same tensor as bytes
 
 
 @dataclass(frozen=True, slots=True)
-class Scale:
+class ByteScale:
     """A real number is ``step * (byte - zero)``."""
 
     step: np.float32
     zero: np.uint8
 
     @classmethod
-    def of_range(cls, low: float, high: float) -> Scale:
+    def of_range(cls, low: float, high: float) -> ByteScale:
         """The finest that reaches from ``low`` to ``high`` and has an exact 0."""
         low, high = min(low, 0.0), max(high, 1e-6)
         step = (high - low) / 255
@@ -41,7 +41,7 @@ class Scale:
 
 
 def with_weights_apart(model: ModelProto) -> ModelProto:
-    """The same graph; weights that it would split while it runs are constants of their own."""
+    """The same graph, where weights that it would split at run time are separate constants."""
     model = copy_of(model)
     constants = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
     for node in [node for node in model.graph.node if node.op_type == "Split"]:
@@ -63,14 +63,14 @@ def with_weights_apart(model: ModelProto) -> ModelProto:
 
 def quantized(
     model: ModelProto,
-    what: Plan,
-    scales: dict[str, Scale],
-    inputs: Mapping[str, Inputs] | None = None,
+    what: QuantizationPlan,
+    scales: dict[str, ByteScale],
+    inputs: Mapping[str, PatchStatistics] | None = None,
 ) -> ModelProto:
     """The same graph with Quantize and Dequantize nodes where the plan wants bytes.
 
-    ``inputs`` are those of convolutions, by the tensors that they give. Weights of the others
-    become the nearest whole numbers.
+    ``inputs`` are statistics of the convolutions' inputs, by output tensor. The weights of other
+    convolutions become the nearest whole numbers.
     """
     writer = _Writer(model, what, scales, inputs or {})
     for entry in model.graph.input:
@@ -89,14 +89,14 @@ class _Writer:
     def __init__(
         self,
         model: ModelProto,
-        what: Plan,
-        scales: dict[str, Scale],
-        inputs: Mapping[str, Inputs],
+        what: QuantizationPlan,
+        scales: dict[str, ByteScale],
+        inputs: Mapping[str, PatchStatistics],
     ) -> None:
         self._model = model
         self._plan = what
         self._inputs = inputs
-        scales = {**scales, **dict.fromkeys(what.images, Scale(np.float32(1), np.uint8(0)))}
+        scales = {**scales, **dict.fromkeys(what.images, ByteScale(np.float32(1), np.uint8(0)))}
         self._scales = {name: scales[source] for name, source in what.source.items()}
         self._old = {tensor.name: tensor for tensor in model.graph.initializer}
         self._outputs = {output.name for output in model.graph.output}
@@ -107,7 +107,7 @@ class _Writer:
         self._asked: dict[str, int] = {}  # result of a widened convolution -> channels asked for
 
     def send_as_bytes(self, name: str) -> None:
-        """If the plan says so, and they are not yet."""
+        """Let the readers of a tensor read bytes, if the plan says so and they do not yet."""
         if name not in self._scales or name in self._reading:
             return
         real = self._plan.absorbed.get(name, name)
@@ -170,7 +170,7 @@ class _Writer:
         return model
 
     def _through_bytes(self, real: str, name: str, like: str) -> str:
-        """``real`` as bytes of the scale of ``like``, and what is real again of that."""
+        """Quantise ``real`` with the scale of ``like``; returns the dequantised tensor's name."""
         by = self._scale(like)
         self._add("QuantizeLinear", [real, *by], name + BYTES)
         return self._add("DequantizeLinear", [name + BYTES, *by], f"{name}.real")
@@ -183,7 +183,7 @@ class _Writer:
         ]
 
     def _doubles(self, node: NodeProto) -> bool:
-        """Whether each cell becomes four."""
+        """Return True if each cell becomes four equal ones."""
         how = {entry.name: entry.s for entry in node.attribute}
         scales = self._old.get(node.input[2]) if len(node.input) == 3 else None
         return (
@@ -210,13 +210,13 @@ class _Writer:
         self._read_bytes(result)
 
     def _read_bytes(self, result: str) -> None:
-        """Have the readers of ``result`` read what its bytes, which there are, stand for."""
+        """Let the readers of ``result`` read its dequantised bytes, which exist already."""
         inputs = [result + BYTES, *self._scale(result)]
         self._reading[result] = self._add("DequantizeLinear", inputs, f"{result}.real")
         self._as_bytes.add(result)
 
     def _sums_bytes(self, node: NodeProto) -> bool:
-        """Whether it multiplies an image with whole numbers that fit into bytes."""
+        """Return True if it multiplies an image with whole numbers that fit into bytes."""
         image, weight = node.input
         if image not in self._plan.images or weight not in self._old:
             return False

@@ -1,4 +1,4 @@
-"""The step of `full` and `fast` in the three parts that their graphs are stitched from."""
+"""The three parts of a step of `full` and `fast`, from which their graphs are stitched."""
 
 from __future__ import annotations
 
@@ -10,50 +10,48 @@ from vergence_models.onnx_export.modules import (
     BATCH,
     COLUMNS,
     ROWS,
-    Part,
-    PartOf,
+    GraphPart,
     Sizes,
+    StepContract,
+    StepModule,
     cells,
-    step_input_names,
-    step_inputs,
-    step_output_names,
 )
-from vergence_models.onnx_export.stitch import TAKES_PLACE, Parts
+from vergence_models.onnx_export.stitch import TAKES_PLACE, StepParts
 
 
-class Begin(PartOf[RaftNetwork]):
+class Begin(StepModule[RaftNetwork]):
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         left, right, matrix, *state = inputs
         _, given, moving = self.network.begin(left, right, matrix, RaftState(*state))
         return *given, *moving
 
 
-class Iterate(PartOf[RaftNetwork]):
+class Iterate(StepModule[RaftNetwork]):
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         given, moving = RaftGiven(*inputs[:3]), RaftState(*inputs[3:])
-        # Every iteration makes the pyramid anew; onnxruntime drops the repetitions.
+        # Every iteration builds the pyramid again; onnxruntime drops the repetitions.
         return self.network.iterate(given, pyramid(given.pairs), moving)
 
 
-class End(PartOf[RaftNetwork]):
+class End(StepModule[RaftNetwork]):
     def forward(self, *moving: Tensor) -> tuple[Tensor, ...]:
         disparity, sigma, following = self.network.end(RaftState(*moving))
         return disparity, sigma, *following
 
 
-def parts_of(network: RaftNetwork) -> Parts[Part]:
-    """What comes before the iterations, one of them, and what comes after."""
+def parts_of(network: RaftNetwork) -> StepParts[GraphPart]:
+    """The part before the iterations, one iteration, and the part after them."""
     given, moving = RaftGiven._fields, tuple(f"at_{name}" for name in RaftState._fields)
     moved = tuple(TAKES_PLACE + name for name in moving)
     stride, cell = network.config.stride, network.config.stride // CELL_PX
     pairs: Sizes = {0: BATCH, 1: cell * ROWS, 2: cell * COLUMNS, 3: cell * COLUMNS}
     eighth, sixteenth = cells(stride, CELL_PX), cells(stride, 2 * CELL_PX)
     given_sizes, moving_sizes = (pairs, eighth, sixteenth), (eighth, eighth, sixteenth)
-    inputs, sizes = step_inputs(network)
+    contract = StepContract.of(network)
     begin = Begin(network)
-    between = begin.examples(*inputs)
-    return Parts(
-        (Part(begin, inputs, sizes, step_input_names(network), given + moving),),
-        Part(Iterate(network), between, given_sizes + moving_sizes, given + moving, moved),
-        Part(End(network), between[3:], moving_sizes, moving, step_output_names(network)),
+    between = begin.examples(*contract.inputs)
+    return StepParts(
+        (GraphPart(begin, contract.inputs, contract.sizes, contract.input_names, given + moving),),
+        GraphPart(Iterate(network), between, given_sizes + moving_sizes, given + moving, moved),
+        GraphPart(End(network), between[3:], moving_sizes, moving, contract.output_names),
     )

@@ -1,9 +1,9 @@
-"""Int8 weights of a convolution, rounded so that their errors cancel on what it sees.
+"""Int8 weights of a convolution, rounded so that their errors cancel on its typical inputs.
 
 The nearest whole number is best for one weight, but not for a sum of products. Here each weight
-takes over the errors of those rounded before it, as far as their inputs vary together (GPTQ,
-Frantar et al. 2023). The bias takes over what the mean input leaves. A third of the squared error
-remains, so seven bits, which pair sums leave to most weights, are as good as eight were.
+compensates the errors of the weights rounded before it, as far as their inputs vary together
+(GPTQ, Frantar et al. 2023). The bias compensates the error at the mean input. A third of the
+squared error remains, so seven bits, which pair sums allow for most weights, are as good as eight.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from vergence_models.onnx_export.pair_sums import range_of_rounding
 Array = NDArray[np.generic]
 Reals = NDArray[np.float64]
 
-PATCHES = 8000  # of each frame and convolution; fewer leave the sums to chance
-# Of the mean variance: inputs that hardly vary would take over errors without limit.
+PATCHES = 8000  # drawn from each frame for each convolution; fewer make the sums noisy
+# A share of the mean variance: without it, inputs that hardly vary would take errors without limit.
 DAMPING = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Inputs:
-    """What a convolution sees in one place: K values, in the order of its weights."""
+class PatchStatistics:
+    """Statistics of a convolution's input patches: K values, in the order of its weights."""
 
     mean: Reals  # [K]
     covariance: Reals  # [K, K]
@@ -36,10 +36,10 @@ class Inputs:
 
 def inputs_of(
     seen: Iterable[Mapping[str, Array]], convolutions: Sequence[NodeProto], model: ModelProto
-) -> dict[str, Inputs]:
-    """Statistics of the patches that convolutions see, by the tensors that they give.
+) -> dict[str, PatchStatistics]:
+    """Statistics of the convolutions' input patches, by output tensor.
 
-    The patches are drawn by the name of that tensor, the same in every graph that has it.
+    The name of that tensor seeds the choice of patches, so it is the same in every graph.
     """
     sizes = {tensor.name: tuple(tensor.dims[2:]) for tensor in model.graph.initializer}
     draws = {
@@ -58,7 +58,7 @@ def inputs_of(
             squares[result] = squares.get(result, 0) + drawn.T @ drawn / len(drawn)
     means = {result: total / frames for result, total in sums.items()}
     return {
-        result: Inputs(mean, squares[result] / frames - np.outer(mean, mean))
+        result: PatchStatistics(mean, squares[result] / frames - np.outer(mean, mean))
         for result, mean in means.items()
     }
 
@@ -67,9 +67,9 @@ def _patches(
     image: Array, node: NodeProto, size: tuple[int, ...], draw: np.random.Generator
 ) -> Reals:
     """Patches of [B, C, H, W] at random places: [PATCHES, C * height * width]."""
-    told = {entry.name: list(entry.ints) for entry in node.attribute}
-    top, left, bottom, right = told.get("pads", [0, 0, 0, 0])
-    down, across = told.get("strides", [1, 1])
+    attributes = {entry.name: list(entry.ints) for entry in node.attribute}
+    top, left, bottom, right = attributes.get("pads", [0, 0, 0, 0])
+    down, across = attributes.get("strides", [1, 1])
     padded = np.pad(image, ((0, 0), (0, 0), (top, bottom), (left, right)))
     windows = np.lib.stride_tricks.sliding_window_view(padded, size, axis=(2, 3))
     windows = windows[:, :, ::down, ::across]
@@ -79,9 +79,9 @@ def _patches(
 
 
 def rounded(weight: Reals, step: Reals, covariance: Reals | None) -> Reals:
-    """Weights [O, K] in whole steps [O], safe in pairs if the nearest whole numbers are.
+    """Weights [O, K] in whole steps [O]; they obey the pair rule if the nearest numbers do.
 
-    Without a ``covariance`` of the inputs they are the nearest.
+    Without a ``covariance`` of the inputs they are the nearest whole numbers.
     """
     wide = step[:, None]
     nearest = np.rint(weight / wide)

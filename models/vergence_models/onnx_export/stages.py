@@ -1,4 +1,4 @@
-"""Whole steps cut into stages: graphs that run side by side, and one that takes what they give."""
+"""Whole steps cut into stages: graphs that run in parallel, and one that takes their outputs."""
 
 from __future__ import annotations
 
@@ -7,29 +7,29 @@ from itertools import chain
 
 from onnx import ModelProto, TensorProto, ValueInfoProto
 
-from vergence_models.config import Kind
+from vergence_models.config import StepKind
 from vergence_models.onnx_export.quantize import BYTES
-from vergence_models.onnx_export.stitch import Parts
+from vergence_models.onnx_export.stitch import StepParts
 
 
 class StageError(RuntimeError):
-    """What should be the same for all kinds of steps is not."""
+    """A graph that all kinds of steps should share differs between two of them."""
 
 
 def in_stages(
-    name: str, models: Mapping[Kind, ModelProto], handed: Sequence[Sequence[ValueInfoProto]]
-) -> tuple[dict[Kind, list[list[str]]], dict[str, ModelProto]]:
-    """Cut whole steps into graphs that run side by side, the same for all kinds, and the rest.
+    name: str, models: Mapping[StepKind, ModelProto], handed: Sequence[Sequence[ValueInfoProto]]
+) -> tuple[dict[StepKind, list[list[str]]], dict[str, ModelProto]]:
+    """Cut whole steps into graphs that run in parallel, the same for all kinds, and the rest.
 
-    ``handed`` says what each of the former gives. Returns the stages of each kind, by file, and
-    the files.
+    ``handed`` lists the outputs of each parallel graph. Returns the stages of each kind, by file,
+    and the files.
 
-    Two graphs on a thread each keep two cores busy with hardly a word between them. The 400
-    operators that onnxruntime would share among two threads, one by one, cost a third more
-    processor time, and no less of the user's.
+    Two graphs with a thread each keep two cores busy and hardly synchronise. If onnxruntime shared
+    each of the 400 operators among two threads, a step would take a third more CPU time and be no
+    faster.
     """
     files: dict[str, ModelProto] = {}
-    stages: dict[Kind, list[list[str]]] = {}
+    stages: dict[StepKind, list[list[str]]] = {}
     for kind, model in models.items():
         made = {result for node in model.graph.node for result in node.output}
         passed = [[as_made(entry, made) for entry in group] for group in handed]
@@ -37,15 +37,17 @@ def in_stages(
         for file, group in zip(first, passed, strict=True):
             graph = cut_out(model, [], group)
             if files.setdefault(file, graph) != graph:
-                raise StageError(f"{file}: is another in {name}_{kind} than in those before it")
+                raise StageError(
+                    f"{file}: {name}_{kind} needs another graph than the kinds before it"
+                )
         last = f"{name}_{kind}.onnx"
         files[last] = cut_out(model, [*chain(*passed)], model.graph.output)
         stages[kind] = [first, [last]]
     return stages, files
 
 
-def handed_on(parts: Parts[ModelProto]) -> list[list[ValueInfoProto]]:
-    """What each graph of ``begin`` gives, as :func:`stitched` names it."""
+def handed_on(parts: StepParts[ModelProto]) -> list[list[ValueInfoProto]]:
+    """The outputs of each graph of ``begin``, as :func:`stitched` names them."""
     return [
         [renamed(entry, f"begin_{number}.{entry.name}") for entry in part.graph.output]
         for number, part in enumerate(parts.begin)

@@ -1,7 +1,7 @@
-"""Graphs of any iteration count, stitched from parts: before the iterations, one, and after.
+"""Graphs of any iteration count, stitched from three kinds of parts: begin, one iteration, end.
 
-Each part goes through the exporter once, whatever the counts; and graphs of all counts hold the
-same weights, so those go into one file beside them.
+Each part goes through the exporter once, whatever the counts. Graphs of all counts hold the same
+weights, which can lie in one file beside them.
 """
 
 from __future__ import annotations
@@ -13,21 +13,22 @@ from typing import Generic, NamedTuple, TypeVar
 import onnx
 from onnx import ModelProto, NodeProto, TensorProto
 
-from vergence_models.config import Kind
+from vergence_models.config import StepKind
 
 T = TypeVar("T")
 SMALL_BYTES = 1024  # such tensors stay in the graph: shapes and scalars that runtimes fold
 ALIGNMENT = 4096  # runtimes map whole pages
 TAKES_PLACE = "to_"
-PLAIN = "plain_"  # before what was found by a look that was not the last
+PLAIN = "plain_"  # prefix of the outputs at 1x, when iterations at 2x follow
 
 
-class CloserLook(NamedTuple, Generic[T]):
-    """What it takes to go on at another size, and to come back.
+class RefinementAt2x(NamedTuple, Generic[T]):
+    """The parts that upsample images and state, and merge the 2x result into the 1x result.
 
-    ``enter`` takes the images and what ``end`` gave, and gives what ``begin`` takes, a state too.
-    That state has not moved: an iteration starts from it by the names in ``moved``. ``join`` takes
-    what ``end`` gave at first, as plain_NAME, and again.
+    ``enter`` takes the images and the outputs of ``end``, and returns the inputs of ``begin``,
+    including a state. That state is in the view of this frame already, so iterations read it
+    unwarped, by the names in ``moved``. ``join`` takes the outputs of ``end`` twice: those at 1x as
+    plain_NAME, those at 2x as NAME.
     """
 
     enter: T
@@ -35,47 +36,47 @@ class CloserLook(NamedTuple, Generic[T]):
     join: T
 
 
-class Parts(NamedTuple, Generic[T]):
-    """What is found before the iterations, by graphs that do not need each other; one; the rest.
+class StepParts(NamedTuple, Generic[T]):
+    """The parts of a step: independent graphs before the iterations, one iteration, the end.
 
-    Outputs are found by name. One that is called to_NAME takes the place of NAME.
+    Parts are connected by names. An output called to_NAME takes the place of NAME.
     """
 
     begin: tuple[T, ...]
     iterate: T
     end: T
-    closer: CloserLook[T] | None = None
+    at_2x: RefinementAt2x[T] | None = None
 
 
-def stitched(parts: Parts[ModelProto], kind: Kind) -> ModelProto:
+def stitched(parts: StepParts[ModelProto], kind: StepKind) -> ModelProto:
     """One graph: inputs of ``begin``, outputs of ``end``, and the iterations between.
 
-    What is computed anew for a closer look and not needed stays in; runtimes leave it out.
+    The 2x part repeats ``begin`` as a whole. Runtimes drop the operators that nothing reads.
     """
-    line = _Line(parts.begin[0])
+    line = _GraphBuilder(parts.begin[0])
     line.begin(parts)
-    line.iterate(parts, range(kind.iterations - kind.closer))
-    if kind.closer:
-        assert parts.closer is not None
+    line.iterate(parts, range(kind.iterations - kind.at_2x))
+    if kind.at_2x:
+        assert parts.at_2x is not None
         plain = line.add("end", parts.end, place="plain_end")
         line.known |= {PLAIN + name: result for name, result in plain.items()}
-        larger = line.add("enter", parts.closer.enter)
-        line.begin(parts, place="closer_")
-        line.known |= {name: larger[given] for given, name in parts.closer.moved.items()}
-        line.iterate(parts, range(kind.iterations - kind.closer, kind.iterations))
+        larger = line.add("enter", parts.at_2x.enter)
+        line.begin(parts, place="closer_")  # a tensor name of the shipped graphs: it stays
+        line.known |= {name: larger[given] for given, name in parts.at_2x.moved.items()}
+        line.iterate(parts, range(kind.iterations - kind.at_2x, kind.iterations))
         line.add("end", parts.end, place="closer_end")
-        line.add("join", parts.closer.join, last=True)
+        line.add("join", parts.at_2x.join, last=True)
     else:
         line.add("end", parts.end, last=True)
     line.model.graph.output.extend(parts.end.graph.output)
     return line.model
 
 
-class _Line:
-    """A graph that grows at its end."""
+class _GraphBuilder:
+    """Builds a graph by appending parts."""
 
     def __init__(self, first: ModelProto) -> None:
-        """With the inputs of ``first``."""
+        """Start with the inputs of ``first``."""
         self.model = ModelProto()
         self.model.CopyFrom(first)
         self._graph = self.model.graph
@@ -84,20 +85,20 @@ class _Line:
         self.known = {entry.name: entry.name for entry in self._graph.input}
         self._weights: set[str] = set()
 
-    def begin(self, parts: Parts[ModelProto], *, place: str = "") -> None:
+    def begin(self, parts: StepParts[ModelProto], *, place: str = "") -> None:
         for number, part in enumerate(parts.begin):
             self.add(f"begin_{number}", part, place=f"{place}begin_{number}")
 
-    def iterate(self, parts: Parts[ModelProto], numbers: Iterable[int]) -> None:
+    def iterate(self, parts: StepParts[ModelProto], numbers: Iterable[int]) -> None:
         for number in numbers:
             self.add("iterate", parts.iterate, place=f"iterate_{number}")
 
     def add(
         self, name: str, part: ModelProto, *, place: str = "", last: bool = False
     ) -> dict[str, str]:
-        """Put a part at the end: its results by name. Those of the last keep their names.
+        """Append a part and return its outputs by name. The last part's outputs keep their names.
 
-        Weights are named after their part, what is computed after the place it is computed at.
+        Weights are named after their part, other tensors after the place of the part.
         """
         place = place or name
         outputs = {entry.name: entry.name.removeprefix(TAKES_PLACE) for entry in part.graph.output}
@@ -117,7 +118,7 @@ class _Line:
 
 
 def renamed(node: NodeProto, names: Mapping[str, str], label: str) -> NodeProto:
-    """The node at another place. An empty name is an input that is left out."""
+    """A copy of the node with other names. An empty name is an omitted input."""
     copy = NodeProto()
     copy.CopyFrom(node)
     copy.name = f"{label}.{node.name}"

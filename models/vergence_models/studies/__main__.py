@@ -1,7 +1,8 @@
 r"""``python -m vergence_models.studies --json FILE``: the paper's studies, on our networks.
 
     python -m vergence_models.studies --json out/studies.json
-    python -m vergence_models.studies --json out/studies.json --studies times     # that table anew
+    python -m vergence_models.studies --json out/studies.json --studies times   # that one again
+    python -m vergence_models.studies --json out/studies.json --render
     python -m vergence_models.studies --json out/studies.json --studies --data vergence:DIR
     python -m vergence_models.studies --json FILE --weights DIR DIR --run runs/lite \
         --data sceneflow:BENCH --kitti vergence:DIR
@@ -26,9 +27,9 @@ from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn
 from vergence_models.config import ConfigError
 from vergence_models.evaluate import WEIGHTS
 from vergence_models.studies.bench import Bench
+from vergence_models.studies.experiments import STUDIES, Study, kitti, on_data
 from vergence_models.studies.footage import StudySettings, group_on_disk
-from vergence_models.studies.networks import gather_contenders, missing_tiers
-from vergence_models.studies.plan import STUDIES, Study, kitti, on_data
+from vergence_models.studies.networks import TIERS, gather_networks
 from vergence_models.studies.plots import draw_plots
 from vergence_models.studies.tables import (
     StudyFileError,
@@ -38,7 +39,7 @@ from vergence_models.studies.tables import (
     write_tables,
 )
 from vergence_models.training.runs import RunError
-from vergence_proto.datasets import LayoutError
+from vergence_proto.datasets import DatasetError
 from vergence_proto.model_io import ManifestError
 
 log = logging.getLogger("vergence_models.studies")
@@ -54,18 +55,19 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     )
     add = parser.add_argument
     add("--json", type=Path, required=True, help="results; Markdown and PNGs go beside it")
-    add("--studies", nargs="*", metavar="NAME", help=f"of {', '.join(STUDIES)}; by default all")
+    add("--render", action="store_true", help="write Markdown and plots of FILE again, run nothing")
+    add("--studies", nargs="*", metavar="NAME", help=f"some of {', '.join(STUDIES)}; default: all")
     add("--weights", type=Path, nargs="+", default=[WEIGHTS], help="folders with a manifest")
     add("--run", type=Path, nargs="*", default=[], help="training runs, computed by PyTorch")
     add("--data", nargs="*", default=[], help="KIND:PATH, each a table of its own")
     add("--kitti", help="KIND:PATH of KITTI odometry with truth, by the paper's protocol")
-    add("--cache", type=Path, default=Path("out/study-clips"), help="of rendered clips")
+    add("--cache", type=Path, default=Path("out/study-clips"), help="folder of rendered clips")
     add("--clips", type=int, default=usual.clips)
-    add("--frames", type=int, default=usual.frames, help="of each clip or sequence, at most")
+    add("--frames", type=int, default=usual.frames, help="most frames of a clip or sequence")
     add("--textures", type=Path, help="folder of photographs for the clips")
     add("--quick", action="store_true", help=f"{QUICK.clips} clips of {QUICK.frames} frames")
     add("--workers", type=int, default=2, help="processes that render")
-    add("--threads", type=int, default=2, help="of each network")
+    add("--threads", type=int, default=2, help="threads of each network")
     given = parser.parse_args(arguments)
     given.studies = list(STUDIES) if given.studies is None else given.studies
     unknown = set(given.studies) - set(STUDIES)
@@ -85,13 +87,19 @@ def chosen(given: argparse.Namespace, frames: int) -> dict[str, Study]:
     return {name: STUDIES[name] for name in STUDIES if name in given.studies} | extra
 
 
-def report(tables: dict[str, Table], missing: list[str], path: Path) -> None:
-    """Write everything that is known by now."""
+def report(tables: dict[str, Table], path: Path) -> None:
+    """Write all finished studies: JSON, Markdown and plots."""
     order = [*STUDIES, *sorted(set(tables) - set(STUDIES))]
     known = [tables[name] for name in order if name in tables]
     write_tables(path, known)
     drawn = draw_plots(known, path.parent)
-    path.with_suffix(".md").write_text(markdown(known, missing, drawn), "utf-8")
+    path.with_suffix(".md").write_text(markdown(known, missing_tiers(known), drawn), "utf-8")
+
+
+def missing_tiers(tables: list[Table]) -> list[str]:
+    """The tiers that no row of the studies is about."""
+    labels = [label for table in tables if table.name in STUDIES for label in table.labels]
+    return [tier for tier in TIERS if labels and not any(row.startswith(tier) for row in labels)]
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -111,11 +119,13 @@ def main(arguments: list[str] | None = None) -> None:
     columns = (SpinnerColumn(), *Progress.get_default_columns()[:1], TimeElapsedColumn())
     try:
         tables = read_tables(given.json)
-        contenders = gather_contenders(given.weights, given.run, threads=given.threads)
-        missing = missing_tiers(contenders)
+        if given.render:
+            report(tables, given.json)
+            return
+        networks = gather_networks(given.weights, given.run, threads=given.threads)
         with Progress(*columns, console=Console(stderr=True)) as progress:
             bench = Bench(
-                contenders,
+                networks,
                 settings=settings,
                 cache=given.cache,
                 workers=given.workers,
@@ -124,11 +134,11 @@ def main(arguments: list[str] | None = None) -> None:
             for name, study in chosen(given, settings.frames).items():
                 log.info("study: %s", name)
                 tables[name] = study(bench)
-                report(tables, missing, given.json)
+                report(tables, given.json)
     except (
         ConfigError,
         FileNotFoundError,
-        LayoutError,
+        DatasetError,
         ManifestError,
         RunError,
         StudyFileError,

@@ -1,4 +1,4 @@
-"""Runs methods over groups of footage, once each, however many studies ask."""
+"""Runs each method over each group of footage once, for all studies."""
 
 from __future__ import annotations
 
@@ -11,42 +11,42 @@ import numpy as np
 from rich.progress import Progress
 
 from vergence_models.evaluation.methods import Method
-from vergence_models.evaluation.metric_accumulator import Tally
-from vergence_models.evaluation.stepping import Footage, View
-from vergence_models.studies.footage import Group, StudySettings, clips_at, whole_clips
-from vergence_models.studies.networks import Contender
+from vergence_models.evaluation.metric_accumulator import MetricAccumulator
+from vergence_models.evaluation.stepping import Footage, FootageView
+from vergence_models.studies.footage import FootageGroup, StudySettings, clips_at, whole_clips
+from vergence_models.studies.networks import StudiedNetwork
 from vergence_proto.geometry import RectifiedRig
 
 
 class Bench:
-    """The contenders, the clips, and what is known of them so far."""
+    """The networks, the clips, and the figures measured so far."""
 
     def __init__(
         self,
-        contenders: Sequence[Contender],
+        networks: Sequence[StudiedNetwork],
         *,
         settings: StudySettings,
         cache: Path,
         workers: int,
         progress: Progress,
     ) -> None:
-        self.contenders = contenders
+        self.networks = networks
         self.settings = settings
         self._cache = cache
         self._workers = workers
         self._progress = progress
-        self._groups: dict[int | None, Group] = {}
-        self._tallies: dict[tuple[str, str], Tally] = {}
+        self._groups: dict[int | None, FootageGroup] = {}
+        self._accumulators: dict[tuple[str, str], MetricAccumulator] = {}
 
-    def clips(self) -> Group:
-        """The held-out clips as a calm head films them, rendered if need be."""
+    def clips(self) -> FootageGroup:
+        """The held-out clips with calm head motion; renders them at the first call."""
         return self._group(None)
 
-    def clips_at(self, speed: int) -> Group:
-        """Shorter ones of the same scenes at a speed, judged by their last frame."""
+    def clips_at(self, speed: int) -> FootageGroup:
+        """Shorter clips of the same scenes at a speed, measured on their last frame."""
         return self._group(speed)
 
-    def _group(self, speed: int | None) -> Group:
+    def _group(self, speed: int | None) -> FootageGroup:
         if speed not in self._groups:
             settings, cache, workers = self.settings, self._cache, self._workers
             self._progress.stop()  # rendering shows its own
@@ -58,13 +58,15 @@ class Bench:
             self._progress.start()
         return self._groups[speed]
 
-    def tallies(self, group: Group, methods: Sequence[Method]) -> dict[str, Tally]:
+    def accumulators(
+        self, group: FootageGroup, methods: Sequence[Method]
+    ) -> dict[str, MetricAccumulator]:
         """Label -> figures over the group, for each method in the order given."""
         wanted = {method.label: method for method in methods}
-        new = [m for label, m in wanted.items() if (group.name, label) not in self._tallies]
+        new = [m for label, m in wanted.items() if (group.name, label) not in self._accumulators]
         if new:
             task = self._progress.add_task(f"{len(new)} methods on {group.name}", total=None)
-            found = {method.label: Tally() for method in new}
+            found = {method.label: MetricAccumulator() for method in new}
             for footage in group:
                 for method in new:
                     found[method.label].add(footage, method.predict(footage))
@@ -72,8 +74,10 @@ class Bench:
                         task, advance=1, description=f"{group.name}: {method.label}"
                     )
             self._progress.remove_task(task)
-            self._tallies |= {(group.name, label): tally for label, tally in found.items()}
-        return {label: self._tallies[group.name, label] for label in wanted}
+            self._accumulators |= {
+                (group.name, label): accumulator for label, accumulator in found.items()
+            }
+        return {label: self._accumulators[group.name, label] for label in wanted}
 
 
 def step_times_ms(
@@ -97,7 +101,7 @@ def step_times_ms(
 
 
 def textured_footage(width: int, height: int, frames: int) -> Footage:
-    """A still view of noise at four scales, all at a disparity of 16 px: something to time on."""
+    """A still view of noise at four scales, at a disparity of 16 px, for measuring times."""
     random = np.random.default_rng(0)
     wide = np.zeros((height, width + 16, 3), np.float32)
     for scale in (2, 8, 32, 128):
@@ -106,4 +110,4 @@ def textured_footage(width: int, height: int, frames: int) -> Footage:
     image = (wide + 128).clip(0, 255).astype(np.uint8)
     left, right = (np.ascontiguousarray(image[:, x : x + width]) for x in (0, 16))
     rig = RectifiedRig(width, height, width, width, width / 2, width / 2, height / 2, 0.1)
-    return Footage("textured", rig, [View(left, right, None)] * frames)
+    return Footage("textured", rig, [FootageView(left, right, None)] * frames)

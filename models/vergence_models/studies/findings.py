@@ -1,34 +1,36 @@
-"""What a table says of the paper's findings, in words computed from its figures."""
+"""Comparison of a table with the paper's findings, in words computed from its figures."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
 
-from vergence_models.evaluation.metric_accumulator import Tally
-from vergence_models.studies.networks import Contender
-from vergence_models.studies.tables import Row
+from vergence_models.evaluation.metric_accumulator import MetricAccumulator
+from vergence_models.studies.networks import StudiedNetwork
+from vergence_models.studies.tables import TableRow
 
 PAPER_SETTLED = 15  # frames, at 30 Hz
-GENTLE = 1.05  # noise of one level may cost so much
+GENTLE = 1.05  # EPE at noise level 1 may be so many times that without noise
 
 
 def verdict(holds: bool) -> str:
     return "holds" if holds else "**does not hold yet**"
 
 
-def main_findings(contenders: Sequence[Contender], found: Mapping[str, Tally]) -> list[str]:
+def main_findings(
+    networks: Sequence[StudiedNetwork], found: Mapping[str, MetricAccumulator]
+) -> list[str]:
     """One warm iteration against the same network without memory, tier by tier."""
     lines = []
-    epes = {label: tally.summary().get("epe") for label, tally in found.items()}
-    for tier in dict.fromkeys(contender.tier for contender in contenders):
-        same = [contender for contender in contenders if contender.tier == tier]
+    epes = {label: accumulator.summary().get("epe") for label, accumulator in found.items()}
+    for tier in dict.fromkeys(studied.tier for studied in networks):
+        same = [studied for studied in networks if studied.tier == tier]
         warm = next((c.warm_methods()[0].label for c in same if c.warm[:1] == (1,)), None)
         warm_epe = None if warm is None else epes.get(warm)
         if warm_epe is None:
             continue
-        for contender in same:
-            counts = zip(contender.single_frame, contender.single_frame_methods(), strict=True)
+        for studied in same:
+            counts = zip(studied.single_frame, studied.single_frame_methods(), strict=True)
             for count, method in counts:
                 alone = epes.get(method.label)
                 if alone is None:
@@ -37,33 +39,33 @@ def main_findings(contenders: Sequence[Contender], found: Mapping[str, Tally]) -
                     f"`{tier}`: one warm iteration has {warm_epe / alone:.2f} times the EPE of the "
                     f"same network, every frame cold, with {count} iterations"
                 )
-                if contender.network.looks_closer(count):
-                    lines.append(f"{line} and a closer look, which the paper's has not.")
+                if studied.network.refines_at_2x(count):
+                    lines.append(f"{line} (the last ones at 2x, which the paper does not have).")
                     continue
-                limit = 1.05 if count >= 20 else 1.0  # of their RAFT-Stereo at 20 and at 7
+                limit = 1.05 if count >= 20 else 1.0  # relative to the paper's RAFT-Stereo
                 holds = verdict(warm_epe <= limit * alone)
                 lines.append(f"{line}; the paper's shape: at most {limit:.2f}: {holds}.")
     return lines
 
 
 def loss_pct(values: Mapping[str, float]) -> float:
-    """What six times the speed costs, in percent of the EPE."""
+    """The increase of EPE at six times the speed, in percent."""
     return 100 * (values["6x"] / values["1x"] - 1)
 
 
 def warp_findings(cells: Mapping[str, Mapping[str, float]]) -> list[str]:
-    """With a warp under 20 % is lost at six times the speed, without over 60 %."""
+    """The paper's shape: EPE at 6x grows by under 20 % with a warp, by over 60 % without."""
     lines = []
     for label, values in cells.items():
         lost = loss_pct(values)
         if label.endswith("state moved"):
-            told = f"the paper's shape: under +20 %: {verdict(lost < 20)}"
+            comparison = f"the paper's shape: under +20 %: {verdict(lost < 20)}"
         elif label.endswith("state not moved"):
             leans = "holds" if lost > 60 else "this network leans less on its past"
-            told = f"the paper's shape: over +60 %: {leans}"
+            comparison = f"the paper's shape: over +60 %: {leans}"
         else:
             continue
-        lines.append(f"{label}: {lost:+.0f} % EPE at 6x; {told}.")
+        lines.append(f"{label}: {lost:+.0f} % EPE at 6x; {comparison}.")
     return lines
 
 
@@ -82,7 +84,7 @@ def noise_findings(cells: Mapping[str, Mapping[str, float]]) -> list[str]:
     return lines
 
 
-def cold_start_findings(rows: Sequence[Row]) -> list[str]:
+def cold_start_findings(rows: Sequence[TableRow]) -> list[str]:
     return [
         f"{row.label}: settled by frame {row.values['settled']:g} (the paper's: by frame "
         f"{PAPER_SETTLED})."

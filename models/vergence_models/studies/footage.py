@@ -1,7 +1,7 @@
-"""What the studies look at: held-out clips at set speeds, and sources on disk.
+"""The footage of the studies: held-out clips at set speeds, and sources on disk.
 
-Clips come from a cache that is rendered once: the same scenes and camera paths at every speed,
-with seeds that no training uses.
+Clips are rendered once into a cache: the same scenes and camera paths at every speed, with seeds
+that no training uses.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ ROOMS = Mix(streets=0.0, swarms=0.0, clutter=0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Group:
-    """Sequences that are judged together; read anew each time, never all in memory."""
+class FootageGroup:
+    """Sequences that are measured together; read again each time, never all in memory."""
 
     name: str
-    words: str  # for a reader of the tables
-    frames: int  # at most so many of each sequence
+    words: str  # description for readers of the tables
+    frames: int  # most frames of each sequence
     read: Callable[[], Iterable[Footage]]
     last_only: bool = False  # judge the last frame alone
 
@@ -43,22 +43,22 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class StudySettings:
-    """How many held-out clips, and of what size; how long to measure times."""
+    """The number and size of held-out clips, and the number of timed frames."""
 
     clips: int = 12
     frames: int = 30  # one second of a headset's camera
-    short: int = 12  # of clips that only a change of speed or of poses is studied on
+    short: int = 12  # frames of the clips on which speed and pose noise are studied
     width: int = 320
     height: int = 256
     textures: Path | None = None  # a folder of photographs; None: procedural textures only
-    timed: int = 5  # frames of each method
+    timed: int = 5  # frames of each method that are timed
 
 
-def clips_at(speed: int, settings: StudySettings, cache: Path, *, workers: int) -> Group:
+def clips_at(speed: int, settings: StudySettings, cache: Path, *, workers: int) -> FootageGroup:
     """Short clips at one speed, judged by their last frame: the same view at every speed."""
     s = settings
     folder = rendered(Playback(speed), s.short, s, cache, workers=workers)
-    return Group(
+    return FootageGroup(
         f"clips, {speed}x",
         f"the last of {s.short} frames of {s.clips} held-out clips of rooms, {s.width}x{s.height}, "
         f"from our generator (seed {SEED}): the same view whatever the speed",
@@ -68,11 +68,11 @@ def clips_at(speed: int, settings: StudySettings, cache: Path, *, workers: int) 
     )
 
 
-def whole_clips(settings: StudySettings, cache: Path, *, workers: int) -> Group:
+def whole_clips(settings: StudySettings, cache: Path, *, workers: int) -> FootageGroup:
     """The clips as a calm head films them."""
     s = settings
     folder = rendered(Playback(), s.frames, s, cache, workers=workers)
-    return Group(
+    return FootageGroup(
         "clips",
         f"{s.clips} held-out clips of rooms, {s.frames} frames, {s.width}x{s.height}, from our "
         f"generator (seed {SEED})",
@@ -101,7 +101,7 @@ def rendered(
     return folder
 
 
-def group_on_disk(spec: str, frames: int) -> Group:
-    """Every source under KIND:PATH. Raises LayoutError as it is read."""
+def group_on_disk(spec: str, frames: int) -> FootageGroup:
+    """Every source under KIND:PATH. Raises DatasetError as it is read."""
     words = f"at most {frames} frames of each sequence in `{spec}`"
-    return Group(spec, words, frames, lambda: footage_on_disk(find_sources(spec)))
+    return FootageGroup(spec, words, frames, lambda: footage_on_disk(find_sources(spec)))

@@ -1,11 +1,11 @@
-"""How far the runs have come, from their own logs: what every other table must be read with."""
+"""Learning curves of the runs, from their own logs; every other table must be read with them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 from vergence_models.studies.bench import Bench
-from vergence_models.studies.tables import Curve, Row, Table
+from vergence_models.studies.tables import Curve, Table, TableRow
 from vergence_models.training.runs import Validation
 
 COLUMNS = {
@@ -17,18 +17,18 @@ COLUMNS = {
 
 
 def learning_curves(bench: Bench) -> Table:
-    """How far each run has come, and whether it still falls."""
-    runs = [contender for contender in bench.contenders if contender.history]
+    """Show the progress of each run, and if its error still falls."""
+    runs = [studied for studied in bench.networks if studied.history]
     rows, curves = [], []
-    for contender in runs:
-        history = contender.history
-        for point in history_told(history):
-            told = {key: point.measured[key] for key in COLUMNS if key in point.measured}
-            rows.append(Row(f"{contender.name}, {point.steps:,} steps", told))
+    for studied in runs:
+        history = studied.history
+        for point in reported_history(history):
+            reported = {key: point.measured[key] for key in COLUMNS if key in point.measured}
+            rows.append(TableRow(f"{studied.name}, {point.steps:,} steps", reported))
         for kind in ("cold", "warm"):
             steps = [float(point.steps) for point in history]
             epes = [point.measured[f"{kind}_epe"] for point in history]
-            curves.append(Curve(f"{contender.name}, {kind}", steps, epes, dashed=kind == "cold"))
+            curves.append(Curve(f"{studied.name}, {kind}", steps, epes, dashed=kind == "cold"))
     return Table(
         name="training",
         title="How far the training has come",
@@ -38,17 +38,17 @@ def learning_curves(bench: Bench) -> Table:
         "not where it will end.",
         columns=COLUMNS,
         rows=rows,
-        training=[contender.training.words for contender in runs],
+        training=[studied.training.words for studied in runs],
         curves=curves,
         x_label="training steps",
         logarithmic=True,
     )
 
 
-def history_told(history: Sequence[Validation]) -> list[Validation]:
+def reported_history(history: Sequence[Validation]) -> list[Validation]:
     """The first, the last, and those between that doubled the steps of the one before."""
-    told = list(history[:1])
+    reported = list(history[:1])
     for point in history[1:-1]:
-        if point.steps >= 2 * told[-1].steps and 2 * point.steps <= history[-1].steps:
-            told.append(point)
-    return told + list(history[1:][-1:])
+        if point.steps >= 2 * reported[-1].steps and 2 * point.steps <= history[-1].steps:
+            reported.append(point)
+    return reported + list(history[1:][-1:])

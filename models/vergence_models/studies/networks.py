@@ -22,8 +22,8 @@ COLD = 8  # iterations on the first frame of a warm sequence, at most
 
 
 @dataclass(frozen=True, slots=True)
-class Training:
-    """How far a network was trained: what every figure of it must be read with."""
+class TrainingSummary:
+    """The amount of training of a network, which every figure of it must be read with."""
 
     name: str
     runtime: str
@@ -32,8 +32,8 @@ class Training:
     device: str
 
     @classmethod
-    def of(cls, name: str, runtime: str, story: dict[str, Any]) -> Training:
-        """``story``: any JSON, as a run tells it and a manifest repeats it."""
+    def of(cls, name: str, runtime: str, story: dict[str, Any]) -> TrainingSummary:
+        """``story``: any JSON, as a run records it and a manifest repeats it."""
         return cls(
             name,
             runtime,
@@ -51,17 +51,17 @@ class Training:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Contender:
+class StudiedNetwork:
     """A network, and the iteration counts it is studied at."""
 
     name: str
     network: SteppedNetwork
-    training: Training
+    training: TrainingSummary
     warm: tuple[int, ...]
     single_frame: tuple[int, ...]
     cold: int  # iterations on the first frame of a warm sequence
     warps: bool  # its state moves with the camera; otherwise poses do not matter to it
-    history: list[Validation] = field(default_factory=list)  # of a run, while it was trained
+    history: list[Validation] = field(default_factory=list)  # validations during a run's training
 
     @property
     def tier(self) -> str:
@@ -79,7 +79,7 @@ class Contender:
         return replace(method, label=f"{method.label}, {cold} on the first frame")
 
 
-def exported(folder: Path, *, threads: int) -> list[Contender]:
+def exported(folder: Path, *, threads: int) -> list[StudiedNetwork]:
     """Every model of a folder of weights. Raises ManifestError."""
     path = folder / MANIFEST_NAME
     try:
@@ -93,10 +93,10 @@ def exported(folder: Path, *, threads: int) -> list[Contender]:
         network = OnnxNetwork(folder, name, threads=threads)
         counts = network.card.graphs
         found.append(
-            Contender(
+            StudiedNetwork(
                 name,
                 network,
-                Training.of(name, "onnxruntime", entry.get("training", {})),
+                TrainingSummary.of(name, "onnxruntime", entry.get("training", {})),
                 warm=tuple(n for n in WARM if n in counts),
                 single_frame=tuple(n for n in SINGLE_FRAME if n in counts) or (max(counts),),
                 cold=network.card.iterations_at_most(COLD),
@@ -106,15 +106,15 @@ def exported(folder: Path, *, threads: int) -> list[Contender]:
     return found
 
 
-def trained(run: Run, beside: Iterable[Contender], *, threads: int) -> Contender:
+def trained(run: Run, beside: Iterable[StudiedNetwork], *, threads: int) -> StudiedNetwork:
     """A training run, for the counts that no exported graph of its name has."""
     tier = run.config_name
     same = [other for other in beside if other.tier == tier]
     name = f"{tier} (PyTorch)"
-    return Contender(
+    return StudiedNetwork(
         name,
         TorchNetwork(run, threads=threads),
-        Training.of(name, "PyTorch", run.story),
+        TrainingSummary.of(name, "PyTorch", run.story),
         warm=tuple(n for n in WARM if all(n not in other.warm for other in same)),
         single_frame=tuple(
             n for n in SINGLE_FRAME if all(n not in other.single_frame for other in same)
@@ -125,24 +125,18 @@ def trained(run: Run, beside: Iterable[Contender], *, threads: int) -> Contender
     )
 
 
-def gather_contenders(weights: list[Path], runs: list[Path], *, threads: int) -> list[Contender]:
+def gather_networks(weights: list[Path], runs: list[Path], *, threads: int) -> list[StudiedNetwork]:
     """All of them, ordered by tier; a model in two folders is taken from the first.
 
     Raises ManifestError, RunError, ConfigError.
     """
-    found: dict[str, Contender] = {}
+    found: dict[str, StudiedNetwork] = {}
     read = [read_run(folder) for folder in runs]  # quick to fail, graphs are slow to load
     for folder in weights:
-        for contender in exported(folder, threads=threads):
-            found.setdefault(contender.name, contender)
+        for studied in exported(folder, threads=threads):
+            found.setdefault(studied.name, studied)
     for run in read:
-        contender = trained(run, list(found.values()), threads=threads)
-        found.setdefault(contender.name, contender)
+        studied = trained(run, list(found.values()), threads=threads)
+        found.setdefault(studied.name, studied)
     order = {name: place for place, name in enumerate(TIERS)}
     return sorted(found.values(), key=lambda c: (order.get(c.tier, len(order)), c.name))
-
-
-def missing_tiers(contenders: Iterable[Contender]) -> list[str]:
-    """Tiers that nothing was given for."""
-    there = {contender.tier for contender in contenders}
-    return [tier for tier in TIERS if tier not in there]

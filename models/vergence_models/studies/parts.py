@@ -1,8 +1,8 @@
 """``python -m vergence_models.studies.parts --run models/runs/lite --val POOL --json FILE``.
 
-What each part of `lite` is worth: its figures on held-out clips with that part silenced in the
-weights, nothing trained again. That is not what a network without the part would have learned, but
-it is measured side by side, and it tells what the weights lean on. Markdown is written beside FILE.
+An ablation of `lite`: its errors on held-out clips with one part at a time switched off in the
+weights, without training again. A network trained without the part would do better, but this
+comparison shows the parts that the shipped weights rely on. Markdown is written beside FILE.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from pathlib import Path
 import torch
 from rich.progress import track
 
-from vergence_models.config import ConfigError, Kind
+from vergence_models.config import ConfigError, StepKind
 from vergence_models.data.pool import ClipPool
 from vergence_models.networks.layers import ConvexUpsampler
 from vergence_models.networks.lite.network import LiteNetwork
-from vergence_models.studies.networks import Training
-from vergence_models.studies.tables import Row, Table, markdown, write_tables
+from vergence_models.studies.networks import TrainingSummary
+from vergence_models.studies.tables import Table, TableRow, markdown, write_tables
 from vergence_models.training.runs import RunError, read_run, trained_network
 from vergence_models.training.validation import START, validate
 
@@ -29,9 +29,9 @@ COLUMNS = {
     for kind in ("cold", "warm")
     for key, label in (("epe", "EPE"), ("d1", "D1 %"), ("d3", "D3 %"))
 }
-NEVER = -1e3  # a logit
+NEVER = -1e3  # a logit that rules a hypothesis out
 PATIENT = "all of it, 8 iterations on cold frames"
-CLOSER = "the same, the last 2 of them a closer look"
+REFINED = "the same, the last 2 of them at 2x"
 
 
 def rims_never_chosen(network: LiteNetwork) -> None:
@@ -40,7 +40,7 @@ def rims_never_chosen(network: LiteNetwork) -> None:
 
 
 def never(*hypotheses: int) -> Callable[[LiteNetwork], None]:
-    """These are never chosen at 1/8; the cell goes on seeing them."""
+    """Never choose these hypotheses at 1/8; they remain inputs of the cell."""
 
     def rule_out(network: LiteNetwork) -> None:
         assert network.update.out.bias is not None
@@ -50,7 +50,7 @@ def never(*hypotheses: int) -> Callable[[LiteNetwork], None]:
 
 
 def silenced(*layers: str) -> Callable[[LiteNetwork], None]:
-    """Layers, or parameters, of these names answer zero."""
+    """Set layers, or parameters, of these names to zero."""
 
     def silence(network: LiteNetwork) -> None:
         for name, parameter in network.named_parameters():
@@ -62,7 +62,7 @@ def silenced(*layers: str) -> Callable[[LiteNetwork], None]:
 
 def claims_unseen(network: LiteNetwork) -> None:
     network.cost_filter.mutual.zero_()
-    network.cost_filter.enter.weight[:, 3] = 0  # the channel that tells of rivals
+    network.cost_filter.enter.weight[:, 3] = 0  # the channel of rival matches
 
 
 def bilinear(network: LiteNetwork) -> None:
@@ -82,9 +82,9 @@ PARTS: dict[str, Callable[[LiteNetwork], None]] = {
     "1/4: no last correction": silenced("refinement.out"),
     "bilinear enlargement": bilinear,
     PATIENT: lambda network: None,
-    CLOSER: lambda network: None,
+    REFINED: lambda network: None,
 }
-STARTS = {PATIENT: Kind(8), CLOSER: Kind(8, closer=2)}
+STARTS = {PATIENT: StepKind(8), REFINED: StepKind(8, at_2x=2)}
 
 
 def table_of_parts(run_folder: Path, pool: ClipPool, *, clips: int) -> Table:
@@ -99,7 +99,7 @@ def table_of_parts(run_folder: Path, pool: ClipPool, *, clips: int) -> Table:
             silence(network)
         start = STARTS.get(label, START)
         figures = validate(network, pool, torch.device("cpu"), clips=clips, start=start)
-        rows.append(Row(label, {key: figures[key] for key in COLUMNS}))
+        rows.append(TableRow(label, {key: figures[key] for key in COLUMNS}))
     return Table(
         name="parts",
         title="What each part of lite is worth",
@@ -108,7 +108,7 @@ def table_of_parts(run_folder: Path, pool: ClipPool, *, clips: int) -> Table:
         "ones 1.",
         columns=COLUMNS,
         rows=rows,
-        training=[Training.of(run.config_name, "PyTorch", run.story).words],
+        training=[TrainingSummary.of(run.config_name, "PyTorch", run.story).words],
     )
 
 

@@ -51,7 +51,7 @@ def draw(axes: Axes, name: str, table: Table) -> None:
 
 
 def draw_runtime(axes: Axes, table: Table) -> None:
-    """Each method as a point: circles remember, squares do not; one colour for a network."""
+    """Each method as a point: circles carry a state, squares do not; one colour for a network."""
     for row in table.rows:
         if "ms" not in row.values or "epe" not in row.values:
             continue

@@ -1,13 +1,15 @@
-"""What a study leaves behind: a table, its curves, and what it says. JSON and Markdown of it."""
+"""The result of a study: a table, its curves and its findings, as JSON and Markdown."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from vergence_models.evaluation.number_format import cell, decimals
 
 FORMAT = 1
 
@@ -16,18 +18,18 @@ TIME_COLUMNS = {"ms": "ms", "fps": "FPS", "cpu_ms": "CPU ms"}  # joined from the
 
 
 class StudyFileError(ValueError):
-    """A JSON file to add to is not one of studies."""
+    """The JSON file holds no studies."""
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class TableRow:
     label: str
-    values: dict[str, float]  # by the keys of the table's columns; what is unknown is left out
+    values: dict[str, float]  # column key -> value; unknown values are missing
 
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """EPE in px over whatever the study varies. A dashed one is drawn beside its like."""
+    """EPE in px over the variable of the study. A dashed curve belongs to a solid one."""
 
     label: str
     x: list[float]
@@ -41,12 +43,12 @@ class Table:
 
     name: str
     title: str
-    text: str  # what was done, on what
+    text: str  # the experiment and its data
     columns: dict[str, str]  # key -> heading
-    rows: list[Row]
+    rows: list[TableRow]
     training: list[str]
     findings: list[str] = field(default_factory=list)
-    paper: list[Row] = field(default_factory=list)  # theirs, on their data
+    paper: list[TableRow] = field(default_factory=list)  # the paper's figures, on its data
     paper_note: str = ""
     curves: list[Curve] = field(default_factory=list)
     x_label: str = ""
@@ -60,8 +62,8 @@ class Table:
 def table_from_dict(values: dict[str, Any]) -> Table:
     """The inverse of ``dataclasses.asdict``; ``values`` is any JSON."""
     lists = {
-        "rows": [Row(**row) for row in values["rows"]],
-        "paper": [Row(**row) for row in values["paper"]],
+        "rows": [TableRow(**row) for row in values["rows"]],
+        "paper": [TableRow(**row) for row in values["paper"]],
         "curves": [Curve(**curve) for curve in values["curves"]],
     }
     return Table(**{**values, **lists})
@@ -93,7 +95,7 @@ def with_times(table: Table, times: Table | None) -> Table:
         return table
     known = {row.label: row.values for row in times.rows}
     rows = [
-        Row(
+        TableRow(
             row.label,
             row.values | {k: v for k, v in known.get(row.label, {}).items() if k in TIME_COLUMNS},
         )
@@ -124,8 +126,12 @@ def _section(table: Table) -> str:
     headings = " | ".join(table.columns[key] for key in columns)
     lines = [f"## {table.title}", "", table.text, "", f"| | {headings} |"]
     lines.append("|---|" + "---:|" * len(columns))
-    lines += [_line(row.label, row, columns) for row in table.rows]
-    lines += [_line(f"*theirs, on their data:* {row.label}", row, columns) for row in table.paper]
+    rows = [*table.rows, *table.paper]
+    places = {
+        key: decimals(row.values[key] for row in rows if key in row.values) for key in columns
+    }
+    lines += [_line(row.label, row, places) for row in table.rows]
+    lines += [_line(f"*theirs, on their data:* {row.label}", row, places) for row in table.paper]
     if table.findings:
         lines += ["", *(f"- {finding}" for finding in table.findings)]
     if table.training:
@@ -135,6 +141,6 @@ def _section(table: Table) -> str:
     return "\n".join(lines)
 
 
-def _line(label: str, row: Row, columns: Sequence[str]) -> str:
-    cells = [f"{row.values[key]:.3g}" if key in row.values else "" for key in columns]
+def _line(label: str, row: TableRow, places: Mapping[str, int]) -> str:
+    cells = [cell(row.values.get(key), count) for key, count in places.items()]
     return f"| {label} | " + " | ".join(cells) + " |"

@@ -1,0 +1,1 @@
+"""Training on pools of clips: batches, augmentation, the trainer, checkpoints and validation."""

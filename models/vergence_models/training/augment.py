@@ -1,4 +1,4 @@
-"""What training does to clips: windows blown up to larger disparities, and flawed cameras."""
+"""Augmentation of clips: windows enlarged to larger disparities, and flawed cameras."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MAX_STRETCH = 4.0
 
 
 def stretched(clips: StereoClips, random: np.random.Generator, *, share: float) -> StereoClips:
-    """Each clip, with chance ``share``, as a window of it blown up to the whole size.
+    """Each clip, with probability ``share``, as a window of it enlarged to the whole size.
 
     Rows grow by up to :data:`MAX_STRETCH` and columns by less, so disparity grows with the rows;
     poses stay true because the camera matrix follows.
@@ -43,16 +43,16 @@ def _stretched(clip: StereoClips, random: np.random.Generator) -> StereoClips:
     y = int(random.integers(height - window_height + 1))
     across, down = width / window_width, height / window_height
 
-    def window(images: Tensor) -> Tensor:
-        return images[..., y : y + window_height, x : x + window_width]
+    rows, columns = slice(y, y + window_height), slice(x, x + window_width)
 
     def grown(planes: Tensor) -> Tensor:
-        return F.interpolate(window(planes)[0, :, None].float(), (height, width))[None, :, 0]
+        cut = planes[0, :, None, rows, columns].float()
+        return F.interpolate(cut, (height, width))[None, :, 0]
 
     def seen(images: Tensor) -> Tensor:
-        cut = window(images)[0].float()
+        cut = images[0, :, rows, columns].permute(0, 3, 1, 2).float().contiguous()
         large = F.interpolate(cut, (height, width), mode="bilinear", align_corners=False)
-        return large.round().clamp(0, 255).to(torch.uint8)[None]
+        return large.round().clamp(0, 255).to(torch.uint8).permute(0, 2, 3, 1)[None]
 
     return replace(
         clip,

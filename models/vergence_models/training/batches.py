@@ -1,7 +1,7 @@
-"""What training eats: the batch of each step, made in this process or ahead of time in others.
+"""Batches for training, made in this process or ahead of time in worker processes.
 
-A batch is a pure function of the seed, the step and the pool. So it is the same whoever makes it,
-and a resumed run goes on with the batch that it would have had.
+A batch is a pure function of the seed, the step and the pool. So every process makes the same one,
+and a resumed run continues with the batch that an undisturbed run would use.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ def batch_at(step: int, pool: ClipPool, training: TrainingConfig) -> StereoClips
 def batches(
     folders: Sequence[Path], training: TrainingConfig, *, first_step: int, workers: int
 ) -> Generator[StereoClips, None, None]:
-    """Batches from ``first_step`` on, without end; close the iterator to end the workers.
+    """Yield batches from ``first_step`` on, without end; close the iterator to end the workers.
 
-    A GPU waits for one process; ``workers`` are that many, each two batches ahead. Raises
-    FileNotFoundError: there are no clips.
+    A single process cannot keep a GPU busy: ``workers`` processes each work two batches ahead.
+    Raises FileNotFoundError: there are no clips.
     """
     if workers == 0:
         pool = ClipPool(*folders)
@@ -63,12 +63,12 @@ def batches(
                 future.cancel()
 
 
-_opened: tuple[ClipPool, TrainingConfig]  # of a worker
+_opened: tuple[ClipPool, TrainingConfig]  # opened once in each worker process
 
 
 def _open(folders: Sequence[Path], training: TrainingConfig) -> None:
     global _opened
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears it, and ends its workers
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles it and ends its workers
     torch.set_num_threads(1)
     _opened = ClipPool(*folders), training
 

@@ -1,8 +1,8 @@
-"""Splitting a large checkpoint into files that travel anywhere: none reaches 16 MiB.
+"""Shards of a large checkpoint: files below 16 MiB, which can be stored anywhere.
 
-What is large is stored in half precision: weights as float16, which keeps more digits, the
+Large tensors are stored in half precision: weights as float16, which keeps more digits, the
 optimizer's moments as bfloat16, which keeps the range that squares of gradients need. Small tensors
-(biases, norms and their statistics) stay exact; they weigh nothing.
+(biases, norms and their statistics) stay exact; they need little room.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-PIECE_BYTES = 15 * 2**20
-SMALL = 2**14  # elements
-LIFTED = "lifted"  # a dictionary of this one key stands where a tensor was taken out
+SHARD_BYTES = 15 * 2**20
+SMALL = 2**14  # tensors of fewer elements stay in the index
+LIFTED = "lifted"  # a dictionary with this one key marks the place of a tensor in a shard
 
 HALF = {"weights": torch.float16, "average": torch.float16, "optimizer": torch.bfloat16}
 
@@ -42,8 +42,8 @@ def replaced(value: Any, change: Callable[[str, Any], Any], name: str = "") -> A
 
 
 def split(value: Any, half: torch.dtype) -> tuple[Any, list[dict[str, Tensor]]]:
-    """Take the large tensors out: what remains, and pieces of them by name, in half precision."""
-    pieces: list[dict[str, Tensor]] = []
+    """Move the large tensors into shards, in half precision; returns the rest, and the shards."""
+    shards: list[dict[str, Tensor]] = []
     room = 0
 
     def lift(name: str, leaf: Any) -> Any:
@@ -52,13 +52,13 @@ def split(value: Any, half: torch.dtype) -> tuple[Any, list[dict[str, Tensor]]]:
             return leaf
         stored = leaf.detach().to("cpu", half)
         if stored.nbytes > room:
-            pieces.append({})
-            room = PIECE_BYTES
+            shards.append({})
+            room = SHARD_BYTES
         room -= stored.nbytes
-        pieces[-1][name] = stored
+        shards[-1][name] = stored
         return {LIFTED: name}
 
-    return replaced(value, lift), pieces
+    return replaced(value, lift), shards
 
 
 def joined(value: Any, tensors: Mapping[str, Tensor]) -> Any:

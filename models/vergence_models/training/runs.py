@@ -1,9 +1,10 @@
-"""What a training run leaves in its folder, and reading it back.
+"""The files of a training run, written and read.
 
-``checkpoint.pt`` holds all that going on needs (weights, their moving average, the optimizer, the
-random states, how far it came); it is replaced in one rename, so a kill leaves the old one whole.
-Those of large networks leave the large tensors to pieces beside it: ``average-*`` is enough to
-export, ``weights-*`` and ``optimizer-*`` to go on. ``log.jsonl`` has a line for every report.
+``checkpoint.pt`` holds everything that a resumed run needs: weights, their moving average, the
+optimizer, the random states and the progress. It is replaced in one rename, so a killed process
+leaves the old file whole. The large tensors of large networks lie in shards beside it: export needs
+``average-*``; a resumed run also needs ``weights-*`` and ``optimizer-*``. ``log.jsonl`` has a line
+for every report.
 """
 
 from __future__ import annotations
@@ -22,21 +23,21 @@ from torch import Tensor
 from vergence_models.config import Config, ConfigError, NetworkConfig, network_from_dict
 from vergence_models.networks.base import AnyNetwork
 from vergence_models.networks.factory import build_network
-from vergence_models.training.checkpoint_shards import HALF, PIECE_BYTES, joined, split, tensors_of
+from vergence_models.training.checkpoint_shards import HALF, SHARD_BYTES, joined, split, tensors_of
 
 CHECKPOINT_NAME = "checkpoint.pt"
 LOG_NAME = "log.jsonl"
 WHOLE_FORMAT = 1  # everything in one file
-PIECES_FORMAT = 2  # an index, and the large tensors beside it
+SHARDED_FORMAT = 2  # an index, and the large tensors beside it
 
 
 class RunError(ValueError):
-    """A run's folder lacks its checkpoint, or holds one of another format or configuration."""
+    """A run's folder has no checkpoint, or one of another format or configuration."""
 
 
 @dataclass(slots=True)
-class Progress:
-    """How far a run has come, over all its sessions."""
+class TrainingProgress:
+    """Totals of a run, over all its sessions."""
 
     steps: int = 0
     frames: int = 0
@@ -45,7 +46,7 @@ class Progress:
 
 @dataclass(frozen=True, slots=True)
 class Validation:
-    """What validation found after so many steps: errors by name, as ``validate`` gives them."""
+    """The errors of a validation after so many steps, by name, as ``validate`` returns them."""
 
     steps: int
     measured: dict[str, float]
@@ -53,31 +54,32 @@ class Validation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Run:
-    """The outcome of a run so far: what export and evaluation need."""
+    """The part of a run that export and evaluation need."""
 
     config_name: str
     network: NetworkConfig
     weights: dict[str, Tensor]  # moving average
     story: dict[str, Any]  # any JSON: command, steps, frames, minutes, device, seed
     measured: dict[str, Any]  # any JSON: the last validation
-    source: str = "a run"  # the file it came from
+    source: str = "a run"  # the checkpoint's path, for error messages
     history: list[Validation] = field(default_factory=list)
 
 
 def save_checkpoint(folder: Path, contents: dict[str, Any]) -> None:
     """Replace a run's checkpoint. ``contents`` is what torch.save takes, with its ``progress``."""
-    if sum(tensor.nbytes for tensor in tensors_of(contents)) < PIECE_BYTES:
+    if sum(tensor.nbytes for tensor in tensors_of(contents)) < SHARD_BYTES:
         save(folder / CHECKPOINT_NAME, {"format": WHOLE_FORMAT, **contents})
         return
-    index = {"format": PIECES_FORMAT, **contents}
+    index = {"format": SHARDED_FORMAT, **contents}
     names: dict[str, list[str]] = {}
     for part, half in HALF.items():
-        index[part], pieces = split(contents[part], half)
-        # New names for new pieces: the old ones stay valid until the index is replaced.
+        index[part], shards = split(contents[part], half)
+        # New names for new shards: the old ones stay valid until the index is replaced.
         steps = contents["progress"]["steps"]
-        names[part] = [f"{part}-{steps:08d}-{number}.pt" for number in range(len(pieces))]
-        for name, piece in zip(names[part], pieces, strict=True):
-            save(folder / name, piece)
+        names[part] = [f"{part}-{steps:08d}-{number}.pt" for number in range(len(shards))]
+        for name, shard in zip(names[part], shards, strict=True):
+            save(folder / name, shard)
+    # "pieces" is the key of the format on disk: older runs have it.
     save(folder / CHECKPOINT_NAME, {**index, "pieces": names})
     kept = {name for part in names.values() for name in part}
     for part in HALF:
@@ -104,9 +106,9 @@ def load_checkpoint(folder: Path, parts: Collection[str] = HALF) -> dict[str, An
     contents = load(path)
     if contents.get("format") == WHOLE_FORMAT:
         return contents
-    if contents.get("format") != PIECES_FORMAT:
+    if contents.get("format") != SHARDED_FORMAT:
         raise RunError(
-            f"{path}: expected checkpoint format {WHOLE_FORMAT} or {PIECES_FORMAT}, "
+            f"{path}: expected checkpoint format {WHOLE_FORMAT} or {SHARDED_FORMAT}, "
             f"got {contents.get('format')}"
         )
     for part in parts:
@@ -171,16 +173,16 @@ def read_history(folder: Path) -> list[Validation]:
 
 
 def load_weights(network: AnyNetwork, weights: Mapping[str, Tensor], source: str) -> None:
-    """Give a network the weights of a run. Raises RunError if they are of another architecture.
+    """Load the weights of a run into a network. Raises RunError if the architecture differs.
 
-    Architectures change while configurations keep their names; nothing but shapes tells.
+    Architectures change while configurations keep their names; only the shapes show it.
     """
     expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
     got = {name: tuple(tensor.shape) for name, tensor in weights.items()}
     for name in sorted(expected | got):
         if expected.get(name) != got.get(name):
             raise RunError(
-                f"{source}: expected weights of today's architecture, these are of another: "
+                f"{source}: expected weights of the present architecture, these are of another: "
                 f"{name} is {got.get(name, 'missing')}, expected {expected.get(name, 'none')}; "
                 "use the version of the project they were trained with"
             )

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,10 +17,10 @@ from vergence_models.config import Config, Precision
 from vergence_models.data.clips import StereoClips
 from vergence_models.networks.base import AnyNetwork, State
 from vergence_models.networks.factory import build_network
-from vergence_models.training.motion import perturbed, uvd_transforms
+from vergence_models.training.camera_motion import perturbed, uvd_transforms
 from vergence_models.training.runs import (
     CHECKPOINT_NAME,
-    Progress,
+    TrainingProgress,
     load_checkpoint,
     load_weights,
     require_same_network,
@@ -33,22 +36,52 @@ def learning_rate(config: Config, step: int) -> float:
     return training.learning_rate * warm * (0.1 + 0.45 * (1 + math.cos(math.pi * done)))
 
 
-def partly_foreign(state: State, random: np.random.Generator) -> State:
-    """The state with a window of it from another clip of the batch: surfaces to let go of again.
+class Window(NamedTuple):
+    """A part of an image, as shares of its height and width from 0 to 1."""
 
-    What a wrong pose or something that moved leaves behind, but anywhere and of any size.
+    top: float
+    bottom: float
+    left: float
+    right: float
+
+    @classmethod
+    def draw(cls, random: np.random.Generator) -> Window:
+        (top, bottom), (left, right) = np.sort(random.random((2, 2)), axis=1).tolist()
+        return cls(top, bottom, left, right)
+
+
+def cutmix_state(state: State, window: Window) -> State:
+    """Replace a window of each state by that of another clip of the batch.
+
+    The network learns to drop wrong surfaces. A wrong pose or a moving object leaves such surfaces
+    behind too; here they have any place and size.
     """
-    (top, bottom), (left, right) = np.sort(random.random((2, 2)), axis=1)
 
     def mixed(tensor: Tensor) -> Tensor:
         height, width = tensor.shape[2:]
-        rows = slice(round(top * height), round(bottom * height))
-        columns = slice(round(left * width), round(right * width))
+        rows = slice(round(window.top * height), round(window.bottom * height))
+        columns = slice(round(window.left * width), round(window.right * width))
         result = tensor.clone()
         result[:, :, rows, columns] = tensor.roll(1, dims=0)[:, :, rows, columns]
         return result
 
     return tuple(mixed(tensor) for tensor in state)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameSchedule:
+    """The conditions under which training steps one frame of a batch."""
+
+    reset: bool  # the frame starts without a state
+    cutmix: Window | None  # the part of the state that comes from another clip
+    iterations: int
+
+
+class Unrolled(NamedTuple):
+    """The steps of a whole batch of clips, before any weight changes."""
+
+    loss: Tensor  # a scalar, with its gradient
+    errors_px: list[float]  # the mean error of each frame
 
 
 class Trainer:
@@ -71,7 +104,7 @@ class Trainer:
             weight_decay=config.training.weight_decay,
         )
         self.random = np.random.default_rng(config.training.seed)
-        self.progress = Progress()
+        self.progress = TrainingProgress()
         self.measured: dict[str, float] = {}
         self.commands: list[str] = []
 
@@ -99,14 +132,14 @@ class Trainer:
         )
 
     def resume(self, folder: Path) -> None:
-        """Go on from a run's checkpoint. Raises RunError if it is of another configuration."""
+        """Continue from a run's checkpoint. Raises RunError if its configuration differs."""
         contents = load_checkpoint(folder)
         require_same_network(contents, self.config, folder / CHECKPOINT_NAME)
         load_weights(self.network, contents["weights"], str(folder / CHECKPOINT_NAME))
         self.average = {k: v.to(self.device) for k, v in contents["average"].items()}
         self.optimizer.load_state_dict(contents["optimizer"])
         self.random.bit_generator.state = contents["random"]
-        self.progress = Progress(**contents["progress"])
+        self.progress = TrainingProgress(**contents["progress"])
         self.measured = contents["measured"]
         self.commands = contents["story"]["commands"]
 
@@ -119,7 +152,7 @@ class Trainer:
         return bool(self.random.random() < share)
 
     def transforms(self, clips: StereoClips) -> Tensor:
-        """The motion the network is told, float32 [B, T, 4, 4]: true, noisy, or none at all."""
+        """The motion that the network sees, float32 [B, T, 4, 4]: true, noisy, or none."""
         training = self.config.training
         poses = clips.world_from_left
         if self.chance(training.identity_share):
@@ -132,53 +165,82 @@ class Trainer:
 
     def step(self, clips: StereoClips) -> dict[str, float]:
         """One update on a batch of clips, with the gradient through the whole clip."""
-        training, network = self.config.training, self.network
-        for group in self.optimizer.param_groups:
-            group["lr"] = learning_rate(self.config, self.progress.steps)
         matrices = self.transforms(clips).to(self.device)
-        clips = clips.to(self.device)
-        batch, frames, _, height, width = clips.left.shape
-        state = cold = network.cold_state(batch, height, width)
-        loss = torch.zeros((), device=self.device)
-        errors = []
+        schedule = self.schedule(clips.frames)
+        unrolled = self.unroll(clips.to(self.device), matrices, schedule)
+        norm = self.update(unrolled.loss)
+        self.progress.steps += 1
+        self.progress.frames += len(clips) * clips.frames
+        first, *later = unrolled.errors_px
+        return {
+            "loss": unrolled.loss.item(),
+            "norm": norm,
+            "first": first,
+            "later": float(np.mean(later)) if later else first,
+        }
+
+    def schedule(self, frames: int) -> list[FrameSchedule]:
+        """Draw the conditions of each frame of a batch."""
+        training = self.config.training
+        scheduled = []
         for frame in range(frames):
             reset = frame == 0 or self.chance(training.reset_share)
-            if reset:
-                state = cold
-            elif self.chance(training.foreign_share):
-                state = partly_foreign(state, self.random)
-            most = training.cold_iterations
+            cutmix = not reset and self.chance(training.cutmix_share)
+            window = Window.draw(self.random) if cutmix else None
             iterations = (
-                int(self.random.integers(1, most + 1)) if reset else 1 + int(self.chance(0.2))
+                int(self.random.integers(1, training.cold_iterations + 1))
+                if reset
+                else 1 + int(self.chance(0.2))
             )
-            left, right = (
-                eye[:, frame].permute(0, 2, 3, 1).contiguous() for eye in (clips.left, clips.right)
-            )
+            scheduled.append(FrameSchedule(reset, window, iterations))
+        return scheduled
+
+    def unroll(
+        self, clips: StereoClips, matrices: Tensor, schedule: Sequence[FrameSchedule]
+    ) -> Unrolled:
+        """Step through the clips by a schedule; ``matrices`` are the motion, [B, T, 4, 4]."""
+        height, width = clips.disparity_px.shape[2:]
+        state = cold = self.network.cold_state(len(clips), height, width)
+        loss = torch.zeros((), device=self.device)
+        errors_px = []
+        for frame, planned in enumerate(schedule):
+            if planned.reset:
+                state = cold
+            elif planned.cutmix is not None:
+                state = cutmix_state(state, planned.cutmix)
             with self.autocast():
-                estimate, state = network(left, right, matrices[:, frame], state, iterations)
+                estimate, state = self.network(
+                    *clips.pair(frame), matrices[:, frame], state, planned.iterations
+                )
             truth = clips.disparity_px[:, frame]
-            loss = loss + estimate.loss(truth, self.config.network.max_disparity_px) / frames
-            errors.append((estimate.disparity.detach() - truth).abs()[truth > 0].mean().item())
+            frame_loss = estimate.loss(truth, self.config.network.max_disparity_px)
+            loss = loss + frame_loss / clips.frames
+            errors_px.append((estimate.disparity.detach() - truth).abs()[truth > 0].mean().item())
+        return Unrolled(loss, errors_px)
+
+    def update(self, loss: Tensor) -> float:
+        """Change the weights by the gradient of a loss, and move their average; returns its norm.
+
+        A gradient that is not finite changes no weight: one bad batch must not end a long run.
+        """
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate(self.config, self.progress.steps)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]  # torch annotates it so
-        norm = torch.nn.utils.clip_grad_norm_(network.parameters(), training.gradient_norm)
-        if torch.isfinite(norm):  # one bad batch must not end a long run
+        norm = torch.nn.utils.clip_grad_norm_(
+            self.network.parameters(), self.config.training.gradient_norm
+        )
+        if torch.isfinite(norm):
             self.optimizer.step()
         # A young average follows quickly, an old one slowly.
-        decay = min(training.ema_decay, (1 + self.progress.steps) / (10 + self.progress.steps))
-        for name, value in network.state_dict().items():
+        steps = self.progress.steps
+        decay = min(self.config.training.ema_decay, (1 + steps) / (10 + steps))
+        for name, value in self.network.state_dict().items():
             if value.is_floating_point():
                 self.average[name].lerp_(value, 1 - decay)
             else:  # a count of batches
                 self.average[name].copy_(value)
-        self.progress.steps += 1
-        self.progress.frames += batch * frames
-        return {
-            "loss": loss.item(),
-            "norm": norm.item(),
-            "first": errors[0],
-            "later": float(np.mean(errors[1:])) if frames > 1 else errors[0],
-        }
+        return norm.item()
 
     def averaged_network(self) -> AnyNetwork:
         """The network with the averaged weights: the one to validate and export."""

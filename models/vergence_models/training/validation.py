@@ -1,4 +1,4 @@
-"""How good a network is on held-out synthetic clips: the figures that choices are made by."""
+"""The errors of a network on held-out synthetic clips; decisions in training rest on them."""
 
 from __future__ import annotations
 
@@ -11,39 +11,36 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vergence_models.config import Kind
+from vergence_models.config import StepKind
 from vergence_models.data.clips import StereoClips
 from vergence_models.data.pool import ClipPool
 from vergence_models.data.sensor import film_as_sensor
-from vergence_models.networks.base import AnyNetwork, Found
+from vergence_models.networks.base import AnyNetwork, StepOutput
 from vergence_models.networks.losses import known
-from vergence_models.training.motion import uvd_transforms
+from vergence_models.training.camera_motion import uvd_transforms
 
-START = Kind(4)  # how the first frame of a clip is stepped
+START = StepKind(4)  # how the first frame of a clip is stepped
 
 
 def filmed(pool: ClipPool, indices: range) -> StereoClips:
-    """Clips as a camera sees them, the same every time."""
+    """Clips with camera flaws, the same at every call."""
     return film_as_sensor(pool.clips(indices), np.random.default_rng(indices.start))
 
 
 @torch.inference_mode()
 def predict(
-    network: AnyNetwork, clips: StereoClips, device: torch.device, *, start: Kind = START
-) -> list[Found]:
-    """What is found in every frame of the clips: cold in the first, then with one iteration."""
+    network: AnyNetwork, clips: StereoClips, device: torch.device, *, start: StepKind = START
+) -> list[StepOutput]:
+    """The output of every frame of the clips: a cold start, then one iteration a frame."""
     matrices = uvd_transforms(clips, clips.world_from_left).to(device)
-    steps: list[Found] = []
-    for frame in range(clips.left.shape[1]):
-        left, right = (
-            eye[:, frame].permute(0, 2, 3, 1).contiguous().to(device)
-            for eye in (clips.left, clips.right)
-        )
+    steps: list[StepOutput] = []
+    for frame in range(clips.frames):
+        left, right = (image.to(device) for image in clips.pair(frame))
         if steps:
             estimate, state = network(left, right, matrices[:, frame], steps[-1].state, 1)
-            steps.append(Found(estimate.disparity, estimate.sigma, state))
+            steps.append(StepOutput(estimate.disparity, estimate.sigma, state))
         else:
-            steps.append(network.cold_step(left, right, start.iterations, closer=start.closer))
+            steps.append(network.cold_step(left, right, start.iterations, at_2x=start.at_2x))
     return steps
 
 
@@ -53,7 +50,7 @@ def validate(
     device: torch.device,
     *,
     clips: int = 48,
-    start: Kind = START,
+    start: StepKind = START,
 ) -> dict[str, float]:
     """Mean errors over the first ``clips`` of a pool: cold (frame 1) and warm (the others).
 
@@ -91,7 +88,7 @@ def save_picture(
     last = predict(network, part, device)[-1]
     rows = []
     for index in range(len(part)):
-        image = part.left[index, -1].permute(1, 2, 0).numpy()[..., ::-1]
+        image = part.left[index, -1].numpy()[..., ::-1]
         truth = part.disparity_px[index, -1].numpy()
         estimate, sigma = (t[index].cpu().numpy() for t in (last.disparity, last.sigma))
         top = max(float(truth.max()), 1.0)

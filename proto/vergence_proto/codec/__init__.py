@@ -1,8 +1,8 @@
-"""Bytes to values and back: the only place where what came over the wire is checked.
+"""Conversion between wire messages and values, and the only check of received data.
 
-Everything ``..._from_proto`` returns holds what :mod:`vergence_proto.types` promises; whatever does
-not is refused here, with the :class:`~vergence_proto.errors.DepthError` that says what was expected
-and what came. Below this border nothing is checked again.
+Every value that a ``..._from_proto`` function returns satisfies :mod:`vergence_proto.types`.
+Invalid data raises the :class:`~vergence_proto.errors.DepthError` that states what was expected and
+what came. The layers below the codec do not check again.
 """
 
 from vergence_proto.codec.frames import (

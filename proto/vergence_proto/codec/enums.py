@@ -1,4 +1,4 @@
-"""The wire's enums and ours, one total table each."""
+"""Tables between the enums of the wire and those of :mod:`vergence_proto.types`, each total."""
 
 from collections.abc import Mapping
 from typing import TypeVar
@@ -11,7 +11,7 @@ from vergence_proto.v1 import depth_pb2 as pb
 Number = TypeVar("Number", bound=int)
 Value = TypeVar("Value")
 
-# "Unspecified", the number of a field nobody set, means the default that depth.proto documents.
+# "Unspecified" is the number of a field that was not set; it means the default in depth.proto.
 AXES = {
     pb.AXES_UNSPECIFIED: Axes.OPENCV,
     pb.AXES_OPENCV: Axes.OPENCV,
@@ -61,12 +61,16 @@ def value_of(
     field: str,
     error: type[DepthError] = BadShape,
 ) -> Value:
-    """Look a number up; protobuf lets through those that only a newer peer knows."""
+    """Return the value of a number.
+
+    Raises ``error``: the number is unknown. Protobuf accepts unknown numbers, since a newer peer
+    may send them.
+    """
     if number not in table:
         raise error(f"{field}: expected one of {sorted(table)} as in depth.proto, got {number}")
     return table[number]
 
 
 def number_of(table: Mapping[Number, Value], value: Value) -> Number:
-    """The number of a value, never that of "unspecified"."""
+    """Return the number of a value, never the number of "unspecified"."""
     return next(number for number, known in table.items() if number and known == value)

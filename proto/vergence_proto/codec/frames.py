@@ -1,4 +1,4 @@
-"""Stereo frames in, disparity maps and errors out."""
+"""Stereo frames, disparity maps, and the errors and settings that travel with them."""
 
 import math
 
@@ -50,9 +50,11 @@ def frame_to_request(
     jpeg_quality: int = 90,
     max_age_s: float | None = None,
 ) -> bytes:
-    """Encode a pair as a ``pb.StreamDepthRequest``, serialized; its images are copied only once.
+    """Encode a pair as the bytes of a ``pb.StreamDepthRequest``; images are copied only once.
 
-    Raises BadImage or BadPose: the frame holds what no server would take.
+    Raises BadImage: an image is not uint8 [H, W, 3] or [H, W], is empty, or does not fit its
+    encoding.
+    Raises BadPose: the pose is not finite, or its matrix is no rotation.
     """
     message = pb.Frame(frame_id=frame.frame_id, capture_ns=frame.capture_ns, max_age_s=max_age_s)
     if frame.pose is not None:
@@ -71,12 +73,14 @@ def frame_from_proto(
 ) -> StereoFrame:
     """Decode both images and the pose.
 
-    ``size`` is the (width, height) that both must have, ``max_bytes`` what they may take together.
+    ``size`` is the required (width, height) of both images, ``max_bytes`` the limit on the bytes of
+    both together.
 
-    Raises FrameTooLarge: more than ``max_bytes``.
-    Raises BadShape: no frame id, another size than ``size`` or two sizes (no image is decoded
-    then), or a maximum age that is no length of time.
-    Raises BadImage, BadPose: as :func:`image_from_proto` and :func:`pose_sample_from_proto`.
+    Raises FrameTooLarge: the images have more than ``max_bytes``.
+    Raises BadShape: the frame id is 0, the sizes differ from ``size`` or from each other (no image
+    is decoded then), or the maximum age is negative or not finite.
+    Raises BadImage: an image is not whole, or not of the stated encoding and size.
+    Raises BadPose: a valid part of the pose is not finite, or its quaternion is not of unit length.
     """
     if message.frame_id == 0:
         raise BadShape("expected a frame_id from 1 upwards, got 0")
@@ -93,7 +97,7 @@ def frame_from_proto(
             f"expected images of {size[0]}x{size[1]}, as the stream was opened with, "
             f"got {left.width}x{left.height}"
         )
-    left_data, right_data = left.data, right.data  # once: every access copies
+    left_data, right_data = left.data, right.data  # read once, because every access copies
     if max_bytes is not None and len(left_data) + len(right_data) > max_bytes:
         raise FrameTooLarge(
             f"expected a frame of at most {max_bytes} bytes, got {len(left_data)} and "
@@ -111,9 +115,10 @@ def frame_from_proto(
 def disparity_to_proto(
     disparity: DisparityMap, output: OutputFormat, *, into: pb.DisparityMap | None = None
 ) -> pb.DisparityMap:
-    """Encode a map, ``into`` the field of a larger message if it is to be one, to save a copy.
+    """Encode a map. ``into`` may be a field of a larger message, which saves a copy.
 
-    Its pose goes as it is, so the caller has put it into the stream's axes.
+    The pose is sent unchanged, so the caller must have converted it to the stream's axes.
+    Raises BadPose: the pose is not finite, or its matrix is no rotation.
     """
     message = pb.DisparityMap() if into is None else into
     message.frame_id, message.capture_ns = disparity.frame_id, disparity.capture_ns
@@ -134,9 +139,11 @@ def disparity_to_proto(
 
 
 def disparity_from_proto(message: pb.DisparityMap, rig: RectifiedRig) -> DisparityMap:
-    """Decode a map of ``rig``, the rig that the stream's opening stated.
+    """Decode a map of ``rig``, the rectified rig in the answer to the stream's opening.
 
-    Raises BadShape: a plane of another size. Raises BadImage: as :func:`plane_from_proto`.
+    Raises BadShape: a plane has another size than the rig, or the origin is unknown.
+    Raises BadImage: a plane is not whole, or not of the stated encoding, compression and size.
+    Raises BadPose: the pose is not finite, or its quaternion is not of unit length.
     """
     for name in ("disparity", "confidence", "sigma"):
         plane: pb.Plane = getattr(message, name)
@@ -167,7 +174,7 @@ def disparity_from_proto(message: pb.DisparityMap, rig: RectifiedRig) -> Dispari
 
 
 def output_format_to_proto(output: OutputFormat) -> pb.OutputFormat:
-    """Raises BadShape: a denominator out of 16 to 64."""
+    """Encode the format. Raises BadShape: the denominator is not 16 to 64."""
     return pb.OutputFormat(
         encoding=number_of(DISPARITY_ENCODING, output.encoding),
         denominator=check_denominator(output.denominator),
@@ -178,9 +185,9 @@ def output_format_to_proto(output: OutputFormat) -> pb.OutputFormat:
 
 
 def output_format_from_proto(message: pb.OutputFormat) -> OutputFormat:
-    """What is not specified is :class:`OutputFormat`'s default.
+    """Decode the format; an unspecified field becomes the default of :class:`OutputFormat`.
 
-    Raises BadShape: a denominator out of 16 to 64, or a number that depth.proto does not have.
+    Raises BadShape: the denominator is not 16 to 64, or depth.proto has no such number.
     """
     return OutputFormat(
         encoding=value_of(DISPARITY_ENCODING, message.encoding, "output encoding"),
@@ -196,7 +203,7 @@ def delivery_to_proto(delivery: Delivery) -> pb.Delivery:
 
 
 def delivery_from_proto(delivery: pb.Delivery) -> Delivery:
-    """Unspecified means newest. Raises BadShape: a number that depth.proto does not have."""
+    """Decode; unspecified means newest. Raises BadShape: depth.proto has no such number."""
     return value_of(DELIVERY, delivery, "delivery")
 
 
@@ -205,7 +212,7 @@ def origin_to_proto(origin: Origin) -> pb.Origin:
 
 
 def origin_from_proto(origin: pb.Origin) -> Origin:
-    """Raises BadShape: a number that depth.proto does not have."""
+    """Decode; unspecified means warm. Raises BadShape: depth.proto has no such number."""
     return value_of(ORIGIN, origin, "origin")
 
 
@@ -239,7 +246,7 @@ def error_to_frame_error(frame_id: int, error: DepthError) -> pb.FrameError:
 
 
 def error_from_frame_error(message: pb.FrameError) -> DepthError:
-    """The error that the server raised about one frame, of the same class."""
+    """Return the error that the server raised about one frame, with the same class."""
     retry_after_s = message.retry_after_s if message.HasField("retry_after_s") else None
     return error_from_wire(message.reason, message.message, retry_after_s)
 

@@ -1,8 +1,8 @@
-"""Camera images: raw rows, JPEG and PNG files, to RGB and back.
+"""Camera images: conversion between RGB and raw rows, JPEG or PNG files.
 
-OpenCV decodes what it can and says little: releases differ in whether half a JPEG is an error or a
-grey lower half, and a picture may be larger than its sender said. So the end of the file and the
-size in its header are read here, before a single pixel is decoded.
+OpenCV does not report every damage: for half a JPEG, some releases raise an error and others return
+a grey lower half. An image may also be larger than its sender stated. So the end of the file and
+the size in its header are checked here, before a pixel is decoded.
 """
 
 import struct
@@ -18,14 +18,14 @@ from vergence_proto.v1 import depth_pb2 as pb
 
 _CHANNELS = {pb.IMAGE_ENCODING_MONO8: 1, pb.IMAGE_ENCODING_RGB8: 3}
 
-# The stored rows are what the rig describes: a viewer's hint to turn them is not for us.
+# The rig describes the rows as they are stored, so a hint to viewers to rotate them is ignored.
 _DECODE_FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"IEND\xaeB`\x82"  # the last chunk's name and checksum
 _JPEG_START = b"\xff\xd8\xff"
 _JPEG_END = b"\xff\xd9"
-# Start-of-frame markers: C0 to CF but for DHT (C4), JPG (C8) and DAC (CC).
+# Start-of-frame markers: C0 to CF except DHT (C4), JPG (C8) and DAC (CC).
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 # Markers without a length: TEM and the restarts, start and end of image.
 _JPEG_BARE = frozenset({0x01, *range(0xD0, 0xDA)})
@@ -34,9 +34,10 @@ _JPEG_BARE = frozenset({0x01, *range(0xD0, 0xDA)})
 def image_to_wire(
     image: NDArray[np.uint8], encoding: ImageEncoding, *, jpeg_quality: int = 90
 ) -> list[Piece]:
-    """A ``pb.Image`` in pieces: uint8 [H, W, 3] RGB, or [H, W] grey at a third of the size.
+    """Encode uint8 [H, W, 3] RGB or [H, W] grey as the pieces of a ``pb.Image``.
 
-    The pieces may look at the image itself. Raises BadImage: another type or shape.
+    A piece may be a view of the image itself.
+    Raises BadImage: the image has another type or shape, is empty, or does not fit the encoding.
     """
     if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)):
         raise BadImage(
@@ -60,10 +61,11 @@ def image_to_wire(
 
 
 def image_from_proto(message: pb.Image, data: bytes | None = None) -> Image:
-    """Decode to uint8 [H, W, 3] RGB; grey is repeated. May be a read-only view of ``data``.
+    """Decode to uint8 [H, W, 3] RGB, possibly a read-only view of ``data``.
 
-    ``data`` is the message's own, from a caller that has looked at it: every access copies it.
-    Raises BadImage: bytes that are not a whole image of the stated encoding and size.
+    A grey image gets three equal channels. ``data`` is ``message.data``, if the caller has read it
+    already; every access copies it.
+    Raises BadImage: the bytes are not a whole image of the stated encoding and size.
     """
     data = message.data if data is None else data
     stated = (message.width, message.height)
@@ -85,9 +87,9 @@ def image_from_proto(message: pb.Image, data: bytes | None = None) -> Image:
 
 
 def decode_image(data: bytes) -> Image:
-    """Decode a whole image file of any kind OpenCV knows to uint8 [H, W, 3] RGB.
+    """Decode an image file of any format that OpenCV reads to uint8 [H, W, 3] RGB.
 
-    Raises BadImage: no such file, or one that is cut short or damaged.
+    Raises BadImage: the bytes are no image file, or one that is cut short or damaged.
     """
     size = image_size(data)
     try:
@@ -100,9 +102,9 @@ def decode_image(data: bytes) -> Image:
 
 
 def image_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height that a PNG, JPEG or WebP file states, without decoding it; else None.
+    """Return (width, height) from the header of a PNG, JPEG or WebP file, for others None.
 
-    Raises BadImage: a PNG or JPEG that is cut short, or without a header.
+    Raises BadImage: a PNG or JPEG is cut short or has no header.
     """
     if data.startswith(_JPEG_START):
         return _jpeg_size(data)

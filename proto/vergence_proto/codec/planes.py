@@ -1,13 +1,14 @@
-"""Result planes: float32 [H, W] to fixed point or IEEE bytes, and back.
+"""Result planes: conversion between float32 [H, W] and fixed point or IEEE bytes.
 
-UINT16 stores round(value * denominator) and 0 for "no value". Compression is lossless: differences
-from the row above (modulo 2^16), folded to small unsigned numbers (0 -1 1 -2 2 to 0 1 2 3 4), all
-low bytes before all high ones, one zstd frame.
+UINT16 stores round(value * denominator), and 0 for "no value". Compression is lossless: it takes
+differences from the row above (modulo 2^16), folds them to small unsigned numbers (0 -1 1 -2 2 to
+0 1 2 3 4), and puts all low bytes before all high bytes into one zstd frame.
 
-On 12 true 640x480 maps of path-traced rooms that is 47 KiB of 600, packed in 0.9 ms and unpacked in
-0.8 ms, for 2 MB of install; horizontal differences without the fold took 63 KiB, 16-bit PNG 66 KiB
-and 5.1 ms, imagecodecs' delta + bitshuffle + zstd 77 KiB and 82 MB, blosc2's bitshuffle + zstd
-101 KiB and 55 MB (one core of two; ``python tests/benchmarks/codec_size.py --data DIR``).
+On 12 true 640x480 maps of path-traced rooms, 600 KiB become 47 KiB, compressed in 0.9 ms and
+decompressed in 0.8 ms, by a library of 2 MB. Horizontal differences without the fold took 63 KiB,
+16-bit PNG 66 KiB and 5.1 ms, imagecodecs' delta + bitshuffle + zstd 77 KiB and 82 MB, blosc2's
+bitshuffle + zstd 101 KiB and 55 MB (one core of two; ``python tests/benchmarks/codec_size.py --data
+DIR``).
 """
 
 import itertools
@@ -26,7 +27,7 @@ if sys.version_info >= (3, 14):
 else:
     from backports import zstd
 
-Stored = NDArray[Any]  # [H, W] of a type that only the message knows
+Stored = NDArray[Any]  # [H, W]; the message states the type
 
 _LARGEST = np.float32(np.iinfo(np.uint16).max)
 _ZSTD_LEVEL = 1  # level 3 gains 3 % and costs up to three times the time
@@ -39,10 +40,11 @@ _WIRE_TYPES: dict[int, np.dtype[Any]] = {
 
 
 def plane_to_proto(plane: Plane, output: OutputFormat, *, into: pb.Plane | None = None) -> pb.Plane:
-    """Encode float32 [H, W], NaN where there is no value, as ``output`` says.
+    """Encode float32 [H, W], NaN where there is no value, in the format ``output``.
 
-    UINT16 has no zero and no negative number: what is below half a step becomes "no value". Above
-    65535 / denominator it saturates. ``into`` is a field of a larger message, to save a copy.
+    UINT16 has no zero and no negative numbers: a value below half a step becomes "no value". Values
+    above 65535 / denominator saturate. ``into`` may be a field of a larger message, which saves a
+    copy.
     """
     match output.encoding:
         case PlaneEncoding.UINT16:
@@ -63,14 +65,14 @@ def plane_to_proto(plane: Plane, output: OutputFormat, *, into: pb.Plane | None 
 def bytes_plane_to_proto(
     plane: NDArray[np.uint8], *, compressed: bool, into: pb.Plane | None = None
 ) -> pb.Plane:
-    """Encode uint8 [H, W]; ``into`` is a field of a larger message, to save a copy."""
+    """Encode uint8 [H, W]. ``into`` may be a field of a larger message, which saves a copy."""
     return _stored_to_proto(plane, pb.PLANE_ENCODING_UINT8, compressed=compressed, into=into)
 
 
 def plane_from_proto(message: pb.Plane) -> Plane:
     """Decode to float32 [H, W], NaN where there is no value.
 
-    Raises BadImage: bytes that are not a whole plane of the stated encoding, compression and size.
+    Raises BadImage: the bytes are not a whole plane of the stated encoding, compression and size.
     """
     if message.encoding == pb.PLANE_ENCODING_UINT8:
         raise BadImage("expected a plane of values, got one of UINT8")
@@ -85,14 +87,17 @@ def plane_from_proto(message: pb.Plane) -> Plane:
 
 
 def bytes_plane_from_proto(message: pb.Plane) -> NDArray[np.uint8]:
-    """Decode uint8 [H, W]. Raises BadImage: as :func:`plane_from_proto`."""
+    """Decode uint8 [H, W].
+
+    Raises BadImage: the bytes are not a whole UINT8 plane of the stated compression and size.
+    """
     if message.encoding != pb.PLANE_ENCODING_UINT8:
         raise BadImage(f"expected a UINT8 plane, got encoding {message.encoding}")
     return _stored(message).astype(np.uint8)
 
 
 def check_denominator(denominator: int) -> int:
-    """Raises BadShape: out of 16 to 64."""
+    """Return the denominator. Raises BadShape: it is not 16 to 64."""
     if not 16 <= denominator <= 64:
         raise BadShape(f"expected a denominator of 16 to 64, got {denominator}")
     return denominator
@@ -109,7 +114,7 @@ def _fixed_point(plane: Plane, denominator: int) -> NDArray[np.uint16]:
 def _stored_to_proto(
     stored: Stored, kind: pb.PlaneEncoding, *, compressed: bool, into: pb.Plane | None
 ) -> pb.Plane:
-    compressed = compressed and stored.dtype.kind == "u"  # of no use to floating point
+    compressed = compressed and stored.dtype.kind == "u"  # it does not help for floating point
     message = pb.Plane() if into is None else into
     message.encoding = kind
     message.compression = pb.COMPRESSION_DELTA_ZSTD if compressed else pb.COMPRESSION_NONE
@@ -122,7 +127,7 @@ def _stored(message: pb.Plane) -> Stored:
     if message.encoding not in _WIRE_TYPES:
         raise BadImage(f"expected a plane encoding of depth.proto, got {message.encoding}")
     dtype = _WIRE_TYPES[message.encoding]
-    data = message.data  # every access copies
+    data = message.data  # read once, because every access copies
     shape = message.height, message.width
     size = message.height * message.width * dtype.itemsize
     if size == 0:
@@ -143,6 +148,7 @@ def _stored(message: pb.Plane) -> Stored:
 
 
 def compress_plane(stored: Stored) -> bytes:
+    """Compress unsigned integers [H, W], as depth.proto describes DELTA_ZSTD."""
     delta = np.empty_like(stored)
     delta[0] = stored[0]
     np.subtract(stored[1:], stored[:-1], out=delta[1:])
@@ -158,9 +164,13 @@ def compress_plane(stored: Stored) -> bytes:
 def decompress_plane(
     data: bytes, size: int, shape: tuple[int, int], dtype: np.dtype[Any]
 ) -> Stored:
+    """Decompress what :func:`compress_plane` made; ``size`` is the number of bytes expected.
+
+    Raises BadImage: ``data`` is not one whole zstd frame of that size.
+    """
     frame = zstd.ZstdDecompressor()
     try:
-        # One byte more than is right shows too much without ever unpacking all of it.
+        # A limit of one byte more detects a plane that is too large without decompressing it.
         unpacked = frame.decompress(data, max_length=size + 1)
     except zstd.ZstdError as error:
         raise BadImage(f"the plane's zstd frame is damaged: {error}") from None
@@ -174,6 +184,8 @@ def decompress_plane(
     for byte, plane in enumerate(shuffled[1:], start=1):
         folded |= plane.astype(dtype) << (8 * byte)
     stored: Stored = (folded >> 1) ^ np.negative(folded & 1)
-    for above, row in itertools.pairwise(stored):  # four times as quick as accumulate on axis 0
+    for above, row in itertools.pairwise(
+        stored
+    ):  # four times as fast as np.add.accumulate on axis 0
         np.add(row, above, out=row)
     return stored

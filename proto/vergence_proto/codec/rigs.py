@@ -1,4 +1,4 @@
-"""Poses, axes and rigs."""
+"""Poses, axes and rigs: conversion between messages and values."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from vergence_proto.geometry import Axes, Matrix, Pose, RectifiedRig
 from vergence_proto.types import Intrinsics, PoseSample, StereoRig
 from vergence_proto.v1 import depth_pb2 as pb
 
-# What rounding to float32 and a few multiplications do to a rotation stays well below it.
+# Rounding to float32 and a few multiplications change a rotation by far less.
 _UNIT_TOLERANCE = 1e-3
 
 
@@ -17,18 +17,18 @@ def axes_to_proto(axes: Axes) -> pb.Axes:
 
 
 def axes_from_proto(axes: pb.Axes) -> Axes:
-    """Unspecified means OpenCV. Raises BadShape: a number that depth.proto does not have."""
+    """Decode; unspecified means OpenCV. Raises BadShape: depth.proto has no such number."""
     return value_of(AXES, axes, "axes")
 
 
 def pose_to_proto(pose: Pose) -> pb.Pose:
-    """Raises BadPose: not finite, or a matrix that is no rotation."""
+    """Encode a pose. Raises BadPose: it is not finite, or its matrix is no rotation."""
     rotation = pose.rotation
     error = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if not (error <= _UNIT_TOLERANCE and np.linalg.det(rotation) > 0):  # NaN fails here too
         raise BadPose(
             f"expected an orthonormal matrix of determinant +1, got {rotation.tolist()}; "
-            "left-handed poses are told by the stream's axes, not by a mirrored matrix"
+            "for left-handed poses, set the stream's axes instead of mirroring the matrix"
         )
     x, y, z, w = pose.orientation_xyzw
     orientation = pb.Quaternion(x=x, y=y, z=z, w=w)
@@ -37,12 +37,15 @@ def pose_to_proto(pose: Pose) -> pb.Pose:
 
 
 def pose_from_proto(message: pb.Pose) -> Pose:
-    """Raises BadPose: not finite, or a quaternion whose length is not 1 within 0.001."""
+    """Decode a pose.
+
+    Raises BadPose: it is not finite, or the length of its quaternion is not 1 within 0.001.
+    """
     return Pose.from_xyzw(_orientation_xyzw(message), _position_m(message))
 
 
 def pose_sample_to_proto(sample: PoseSample) -> pb.PoseSample:
-    """Raises BadPose: as :func:`pose_to_proto`."""
+    """Encode a sample. Raises BadPose: its pose is not finite, or its matrix is no rotation."""
     return pb.PoseSample(
         world_from_left=pose_to_proto(sample.world_from_left),
         orientation_valid=sample.orientation_valid,
@@ -52,9 +55,9 @@ def pose_sample_to_proto(sample: PoseSample) -> pb.PoseSample:
 
 
 def pose_sample_from_proto(message: pb.PoseSample) -> PoseSample:
-    """A part that is flagged invalid is undefined, as in OpenXR, and is read as the identity.
+    """Decode a sample. A part flagged invalid is undefined, as in OpenXR, and becomes the identity.
 
-    Raises BadPose: as :func:`pose_from_proto`, about the parts that are flagged valid.
+    Raises BadPose: a part flagged valid is not finite, or is no unit quaternion.
     """
     pose = message.world_from_left
     unknown = Pose.identity()
@@ -68,7 +71,7 @@ def pose_sample_from_proto(message: pb.PoseSample) -> PoseSample:
 
 
 def rig_to_proto(rig: StereoRig) -> pb.StereoRig:
-    """Raises BadCalibration: ``left_from_right`` is no rigid transform."""
+    """Encode a rig. Raises BadCalibration: ``left_from_right`` is no rigid transform."""
     try:
         left_from_right = pose_to_proto(rig.left_from_right)
     except BadPose as error:
@@ -81,7 +84,11 @@ def rig_to_proto(rig: StereoRig) -> pb.StereoRig:
 
 
 def rig_from_proto(message: pb.StereoRig) -> StereoRig:
-    """Raises BadCalibration: a part is missing, or the rig is not one that sees in stereo."""
+    """Decode a rig.
+
+    Raises BadCalibration: a part is missing, a camera's intrinsics are invalid, or the rig cannot
+    be used for stereo.
+    """
     for part in ("left", "right", "left_from_right"):
         if not message.HasField(part):
             raise BadCalibration(f"the rig has no {part}; send both cameras and left_from_right")
@@ -110,7 +117,10 @@ def rectified_rig_to_proto(rig: RectifiedRig) -> pb.RectifiedRig:
 
 
 def rectified_rig_from_proto(message: pb.RectifiedRig) -> RectifiedRig:
-    """Raises BadCalibration: a size, focal length or baseline that is not a positive number."""
+    """Decode a rig.
+
+    Raises BadCalibration: a size, focal length or the baseline is not a positive number.
+    """
     rig = RectifiedRig(
         message.width,
         message.height,
@@ -121,7 +131,7 @@ def rectified_rig_from_proto(message: pb.RectifiedRig) -> RectifiedRig:
         message.cy,
         message.baseline_m,
     )
-    StereoRig.from_rectified(rig)  # it knows what a rig must be
+    StereoRig.from_rectified(rig)  # checks the values
     if rig.baseline_m < 0:
         raise BadCalibration(f"the baseline must be positive metres, got {rig.baseline_m}")
     return rig
@@ -181,6 +191,6 @@ def _finite(numbers: list[float] | Matrix, part: str) -> Matrix:
     if not np.isfinite(array).all():
         raise BadPose(
             f"expected a finite {part}, got {array.tolist()}; "
-            "where tracking is lost, send the pose with its valid flag off"
+            "if tracking is lost, send the pose with its valid flags off"
         )
     return array

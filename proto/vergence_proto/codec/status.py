@@ -1,4 +1,4 @@
-"""A DepthError as a ``google.rpc.Status``: ErrorInfo for programs, RetryInfo where it helps."""
+"""DepthError as a ``google.rpc.Status``, with ErrorInfo and, if waiting helps, RetryInfo."""
 
 from google.protobuf.duration_pb2 import Duration
 from google.rpc import error_details_pb2, status_pb2
@@ -7,7 +7,7 @@ from vergence_proto.errors import ERROR_DOMAIN, DepthError, error_from_wire
 
 
 def error_to_status(error: DepthError, code: int) -> status_pb2.Status:
-    """``code`` is the error's number in ``google.rpc.Code``, which is also its gRPC status."""
+    """Encode an error; ``code`` is its gRPC status, a number of ``google.rpc.Code``."""
     status = status_pb2.Status(code=code, message=str(error))
     info = error_details_pb2.ErrorInfo(reason=error.code, domain=ERROR_DOMAIN)
     status.details.add().Pack(info)
@@ -19,7 +19,7 @@ def error_to_status(error: DepthError, code: int) -> status_pb2.Status:
 
 
 def error_from_status(status: status_pb2.Status) -> DepthError | None:
-    """The error that was raised; None for a status that is not ours."""
+    """Return the error that was raised, or None for a status that Vergence did not make."""
     retry_after_s, info = None, None
     for detail in status.details:
         if detail.Is(error_details_pb2.RetryInfo.DESCRIPTOR):

@@ -1,17 +1,17 @@
-"""Messages of megabytes, laid out by hand.
+"""Serialisation of large messages by hand.
 
-Protobuf copies bytes into the message that gets them, from there into a buffer that it lets grow,
-and from there into the result: four copies, and for a pair of images that is a millisecond. In
-pieces that are joined once it is one. (https://protobuf.dev/programming-guides/encoding/)
+Protobuf copies bytes into the message, then into a buffer that it enlarges, then into the result.
+That is four copies, or a millisecond for a pair of images. Pieces that are joined once need one
+copy. (https://protobuf.dev/programming-guides/encoding/)
 """
 
-Piece = bytes | memoryview  # one byte an item
+Piece = bytes | memoryview  # items of one byte
 
 _LENGTH_DELIMITED = 2  # the wire type of messages and bytes
 
 
 def delimited(number: int, *pieces: Piece) -> list[Piece]:
-    """Field ``number``, a message or bytes that ``pieces`` are when joined."""
+    """Return the pieces of field ``number``, whose content is ``pieces`` joined."""
     size = sum(map(len, pieces))
     return [_varint(number << 3 | _LENGTH_DELIMITED) + _varint(size), *pieces]
 

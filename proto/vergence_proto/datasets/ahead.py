@@ -1,4 +1,4 @@
-"""Frames of a source for an event loop: the next is read while the last is in use."""
+"""Read the frames of a source for an event loop, one frame ahead."""
 
 import asyncio
 from collections.abc import AsyncGenerator, Iterator
@@ -9,9 +9,9 @@ from vergence_proto.datasets.source import SourceFrame, StereoSource
 async def read_ahead(
     source: StereoSource, *, start: int = 0
 ) -> AsyncGenerator[tuple[int, SourceFrame], None]:
-    """Index from ``start`` and frame, each decoded in a thread while the one before is in use.
+    """Yield index and frame from ``start`` on; decode the next frame while one is in use.
 
-    Raises LayoutError: a file cannot be read.
+    Decoding runs in a thread. Raises DatasetError: a file cannot be read.
     """
     frames: Iterator[SourceFrame] = (source[index] for index in range(start, len(source)))
     coming = asyncio.create_task(asyncio.to_thread(next, frames, None))

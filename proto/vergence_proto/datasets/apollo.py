@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vergence_proto.datasets.files import LayoutError, numbers
+from vergence_proto.datasets.files import DatasetError, numbers
 from vergence_proto.datasets.listing import found, image_beside, images, read_lines
 from vergence_proto.datasets.packings import nominal_rig, read_mask, read_scaled, size_of
 from vergence_proto.datasets.source import FrameFiles, StereoSource, Truth, rectified_rig
@@ -30,21 +30,24 @@ _IMAGE = r"\d{6}_\d{9}_Camera_5"
 
 
 def find(root: Path) -> list[Path]:
-    """Every recording in or under ``root``."""
+    """List every recording in or under ``root``."""
     return [
         folder.parent for folder in found(root, "camera_5") if (folder.parent / "camera_6").is_dir()
     ]
 
 
 def open_path(path: Path, *, steps: float = _STEPS_PER_PX) -> StereoSource:
-    """Raises LayoutError: a file is missing or wrong."""
+    """Open one recording.
+
+    Raises DatasetError: a file is missing or wrong.
+    """
     lefts = images(path / "camera_5", _IMAGE)
     if not lefts:
-        raise LayoutError(
+        raise DatasetError(
             f"{path / 'camera_5'}: expected images 171206_034625454_Camera_5.jpg, found none"
         )
     if not steps > 0:
-        raise LayoutError(f"{path}: expected positive steps a pixel, got {steps:g}")
+        raise DatasetError(f"{path}: expected positive steps a pixel, got {steps:g}")
     files = [
         FrameFiles(
             left,
@@ -69,7 +72,7 @@ def _read_rig(path: Path, size: tuple[int, int]) -> StereoRig:
     text = " ".join(read_lines(origin / "intrinsic.txt", "K = [f, 0, cx; 0, f, cy; 0, 0, 1]"))
     matrix = re.search(r"K\s*=\s*\[([^\]]*)\]", text)
     if matrix is None:
-        raise LayoutError(f"{origin / 'intrinsic.txt'}: expected K = [...], got {text[:60]!r}")
+        raise DatasetError(f"{origin / 'intrinsic.txt'}: expected K = [...], got {text[:60]!r}")
     words = matrix[1].replace(";", " ")
     fx, _, cx, _, fy, cy, *_ = numbers(words, 9, f"{origin / 'intrinsic.txt'}, K")
     return rectified_rig(
@@ -88,7 +91,7 @@ def _capture_ns(path: Path) -> int:
     try:
         whole = datetime.datetime.strptime(f"{date}{time[:6]}+0000", "%y%m%d%H%M%S%z")
     except ValueError as error:
-        raise LayoutError(f"{path}: expected a time in the name: {error}") from None
+        raise DatasetError(f"{path}: expected a time in the name: {error}") from None
     return int(whole.timestamp()) * 1_000_000_000 + int(time[6:]) * 1_000_000
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vergence_proto.datasets.files import LayoutError, existing, numbers
+from vergence_proto.datasets.files import DatasetError, existing, numbers
 from vergence_proto.datasets.listing import found, image_beside, images
 from vergence_proto.datasets.packings import (
     known_offsets,
@@ -39,7 +39,7 @@ _MM_PER_M = 1000.0
 
 
 def find(root: Path) -> list[Path]:
-    """Every scene in or under ``root``."""
+    """List every scene in or under ``root``."""
     return [
         folder.parent
         for folder in found(root, "camera_00")
@@ -48,10 +48,13 @@ def find(root: Path) -> list[Path]:
 
 
 def open_path(path: Path) -> StereoSource:
-    """Raises LayoutError: a file is missing or wrong."""
+    """Open one scene.
+
+    Raises DatasetError: a file is missing or wrong.
+    """
     lefts = images(path / "camera_00")
     if not lefts:
-        raise LayoutError(f"{path / 'camera_00'}: expected images im0.png, im1.png, found none")
+        raise DatasetError(f"{path / 'camera_00'}: expected images im0.png, im1.png, found none")
     rig, metric = _read_rig(path / "calib_00-02.xml", size_of(lefts[0]))
     truth = path / "disp_00.npy"
     files = [
@@ -72,11 +75,11 @@ def _read_rig(path: Path, size: tuple[int, int]) -> tuple[StereoRig, bool]:
     try:
         root = ElementTree.fromstring(existing(path, "Booster's calibration").read_bytes())
     except ElementTree.ParseError as error:
-        raise LayoutError(f"{path}: expected OpenCV's XML: {error}") from None
+        raise DatasetError(f"{path}: expected OpenCV's XML: {error}") from None
     left, right = (_matrix(path, root, name) for name in ("proj_matL", "proj_matR"))
     baseline = root.findtext("baselineLR")
     if baseline is None:
-        raise LayoutError(f"{path}: expected <baselineLR> in millimetres, found none")
+        raise DatasetError(f"{path}: expected <baselineLR> in millimetres, found none")
     rig = rectified_rig(
         path,
         size,
@@ -93,7 +96,7 @@ def _read_rig(path: Path, size: tuple[int, int]) -> tuple[StereoRig, bool]:
 def _matrix(path: Path, root: ElementTree.Element, name: str) -> Matrix:
     words = root.findtext(f"{name}/data")
     if words is None:
-        raise LayoutError(f"{path}: expected <{name}> with <data>, found none")
+        raise DatasetError(f"{path}: expected <{name}> with <data>, found none")
     return np.reshape(numbers(words, 12, f"{path}, {name}"), (3, 4))
 
 

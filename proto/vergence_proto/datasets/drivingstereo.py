@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vergence_proto.datasets.files import LayoutError
+from vergence_proto.datasets.files import DatasetError
 from vergence_proto.datasets.listing import found, image_beside, images, read_keyed
 from vergence_proto.datasets.packings import nominal_rig, read_scaled, size_of
 from vergence_proto.datasets.source import FrameFiles, StereoSource, Truth, rectified_rig
@@ -36,7 +36,7 @@ _CALIB_LEVELS = 5  # folders upwards in which to look for calib/
 
 
 def find(root: Path) -> list[Path]:
-    """Every drive in or under ``root``."""
+    """List every drive in or under ``root``."""
     lefts = {
         path.parent
         for path in found(root, "*_*-*.*")
@@ -51,15 +51,18 @@ def find(root: Path) -> list[Path]:
 
 
 def open_path(path: Path) -> StereoSource:
-    """Raises LayoutError: a file is missing or wrong."""
+    """Open one drive.
+
+    Raises DatasetError: a file is missing or wrong.
+    """
     if not any(_LEFT.search(part) for part in path.parts):
-        raise LayoutError(
+        raise DatasetError(
             f"{path}: expected a drive under left-image-half-size or train-left-image"
         )
     folder = path if path.is_dir() else path.parent
     lefts = images(folder, rf"{re.escape(path.name)}_{_DRIVE}-\d+")
     if not lefts:
-        raise LayoutError(f"{folder}: expected images {path.name}_<time>.jpg, found none")
+        raise DatasetError(f"{folder}: expected images {path.name}_<time>.jpg, found none")
     right, disparity = (_beside(folder, kind) for kind in ("right{0}image", "disparity{0}map"))
     size = size_of(lefts[0])
     full = "full-size" in str(folder) or ("half-size" not in str(folder) and size[0] >= _FULL_WIDTH)
@@ -86,7 +89,7 @@ def _capture_ns(path: Path) -> int:
     try:
         time = datetime.datetime(*(int(part) for part in date), tzinfo=datetime.UTC)  # type: ignore[arg-type,misc]
     except ValueError as error:
-        raise LayoutError(f"{path}: expected a time in the name: {error}") from None
+        raise DatasetError(f"{path}: expected a time in the name: {error}") from None
     return int(time.timestamp()) * 1_000_000_000 + int(milliseconds) * 1_000_000
 
 
@@ -108,7 +111,7 @@ def _read_rig(path: Path, calib: str, size: tuple[int, int]) -> tuple[StereoRig,
     read = read_keyed(origin, "DrivingStereo's cameras", P_rect_101=12, P_rect_103=12, T_103=3)
     for key in ("P_rect_101", "P_rect_103", "T_103"):
         if key not in read:
-            raise LayoutError(f"{origin}: expected a line {key}: with numbers, found none")
+            raise DatasetError(f"{origin}: expected a line {key}: with numbers, found none")
     left, right = (np.reshape(read[key], (3, 4)) for key in ("P_rect_101", "P_rect_103"))
     rig = rectified_rig(
         origin,

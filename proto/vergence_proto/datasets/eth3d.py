@@ -1,7 +1,7 @@
 """ETH3D two-view: ``eth3d:ROOT/two_view_training/playground_1l``.
 
-Calibration and images are as Middlebury's; the truth lies in a folder beside,
-``ROOT/two_view_training_gt/playground_1l`` (or in the scene's own).
+Calibration and images have Middlebury's layout. The truth is in a separate folder,
+``ROOT/two_view_training_gt/playground_1l``, or in the folder of the scene.
 """
 
 from pathlib import Path
@@ -9,10 +9,13 @@ from pathlib import Path
 from vergence_proto.datasets import middlebury
 from vergence_proto.datasets.source import StereoSource
 
-find = middlebury.find
+
+def find(root: Path) -> list[Path]:
+    """List every scene in or under ``root``."""
+    return middlebury.find(root)
 
 
 def open_path(path: Path) -> StereoSource:
-    """Raises LayoutError: a file is missing or wrong."""
+    """Open one scene. Raises DatasetError: a file is missing or wrong."""
     beside = path.parent.with_name(f"{path.parent.name}_gt") / path.name
     return middlebury.open_scene(path, truth_folder=beside if beside.is_dir() else path)

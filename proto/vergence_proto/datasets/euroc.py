@@ -1,4 +1,4 @@
-"""EuRoC and its kin (ASL layout; TUM-VI): ``euroc:ROOT/MH_01_easy`` or ``.../mav0``.
+"""EuRoC, TUM-VI and others in the ASL layout: ``euroc:ROOT/MH_01_easy`` or ``.../mav0``.
 
 ::
 
@@ -6,8 +6,8 @@
     mav0/cam0 cam1/sensor.yaml        T_BS (camera to body), resolution, intrinsics, distortion
     mav0/state_groundtruth_estimate0/data.csv    (TUM-VI: mocap0) timestamp, p, q as w x y z
 
-The pair is not rectified: the rig carries the distortion as it is. Poses of the body are
-interpolated to the images' times; images outside the ground truth, or in a hole of it, have none.
+The pair is not rectified, so the rig includes the distortion. Poses of the body are interpolated
+to the times of the images. An image before, after or in a gap of the ground truth has no pose.
 """
 
 import re
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vergence_proto.datasets.files import LayoutError, numbers, read_text
+from vergence_proto.datasets.files import DatasetError, numbers, read_text
 from vergence_proto.datasets.poses import checked_orientation, checked_pose, interpolated
 from vergence_proto.datasets.source import FrameFiles, StereoSource
 from vergence_proto.errors import BadCalibration
@@ -30,23 +30,26 @@ _DISTORTIONS = {
 
 
 def find(root: Path) -> list[Path]:
-    """Every ``mav0`` in or under ``root``."""
+    """List every ``mav0`` in or under ``root``."""
     return sorted(path.parent.parent for path in root.rglob("cam0/sensor.yaml"))
 
 
 def open_path(path: Path) -> StereoSource:
-    """Raises LayoutError: a file is missing or wrong; calibration and poses are read at once."""
+    """Open one sequence; calibration and poses are read now.
+
+    Raises DatasetError: a file is missing or wrong.
+    """
     mav = path / "mav0" if (path / "mav0").is_dir() else path
     body_from_left, left = _read_camera(mav / "cam0" / "sensor.yaml")
     body_from_right, right = _read_camera(mav / "cam1" / "sensor.yaml")
     try:
         rig = StereoRig(left, right, body_from_left.inverse() @ body_from_right)
     except BadCalibration as error:
-        raise LayoutError(f"{mav / 'cam1' / 'sensor.yaml'}: {error}") from None
+        raise DatasetError(f"{mav / 'cam1' / 'sensor.yaml'}: {error}") from None
     lefts, rights = (_read_images(mav / camera) for camera in ("cam0", "cam1"))
     times_ns = sorted(lefts.keys() & rights.keys())
     if not times_ns:
-        raise LayoutError(f"{mav}: cam0 and cam1 have no timestamp in common")
+        raise DatasetError(f"{mav}: cam0 and cam1 have no timestamp in common")
     poses = _body_poses(mav, times_ns)
     files = [
         FrameFiles(
@@ -63,7 +66,7 @@ def open_path(path: Path) -> StereoSource:
 
 
 def _read_camera(path: Path) -> tuple[Pose, Intrinsics]:
-    """body_from_camera and the camera."""
+    """Read body_from_camera and the intrinsics."""
     text = read_text(path, "a camera's calibration")
     body_from_camera = checked_pose(
         np.reshape(_list(path, text, "data", 16), (4, 4)), f"{path}, T_BS"
@@ -71,7 +74,7 @@ def _read_camera(path: Path) -> tuple[Pose, Intrinsics]:
     width, height = _list(path, text, "resolution", 2)
     model = re.search(r"^distortion_model:\s*([\w-]+)", text, re.MULTILINE)
     if model is None or model[1] not in _DISTORTIONS:
-        raise LayoutError(
+        raise DatasetError(
             f"{path}: expected distortion_model {' or '.join(_DISTORTIONS)}, "
             f"got {model[1] if model else 'none'}"
         )
@@ -82,14 +85,14 @@ def _read_camera(path: Path) -> tuple[Pose, Intrinsics]:
             int(width), int(height), fx, fy, cx, cy, _DISTORTIONS[model[1]], coefficients
         )
     except BadCalibration as error:
-        raise LayoutError(f"{path}: {error}") from None
+        raise DatasetError(f"{path}: {error}") from None
 
 
 def _list(path: Path, text: str, key: str, count: int | None) -> list[float]:
-    """A list of numbers from the little YAML that these files use; it may go over several lines."""
+    """Read a list of numbers, on one line or several; these files use only a little of YAML."""
     found = re.search(rf"^\s*{key}:\s*\[([^\]]*)\]", text, re.MULTILINE)
     if found is None:
-        raise LayoutError(f"{path}: expected {key}: [...], found none")
+        raise DatasetError(f"{path}: expected {key}: [...], found none")
     return numbers(found[1], count, f"{path}, {key}")
 
 
@@ -100,7 +103,7 @@ def _read_images(camera: Path) -> dict[int, Path]:
         if line.strip() and not line.startswith("#"):
             time_ns, comma, name = line.partition(",")
             if not comma or not time_ns.strip().isdecimal():
-                raise LayoutError(f"{path}: expected 'timestamp,filename', got {line!r}")
+                raise DatasetError(f"{path}: expected 'timestamp,filename', got {line!r}")
             images[int(time_ns)] = camera / "data" / name.strip()
     return images
 
@@ -114,14 +117,14 @@ def _body_poses(mav: Path, times_ns: list[int]) -> list[Pose | None]:
     for line in lines:
         if not line.strip() or line.startswith("#"):
             continue
-        # The time apart: 19 digits of nanoseconds do not fit a float.
+        # The time is parsed separately: 19 digits of nanoseconds do not fit a float.
         time_ns, _, rest = line.partition(",")
         origin = f"{path}, {time_ns}"
         if not time_ns.strip().isdecimal():
-            raise LayoutError(f"{path}: expected a timestamp in ns, got {time_ns!r}")
+            raise DatasetError(f"{path}: expected a timestamp in ns, got {time_ns!r}")
         values: Matrix = np.array(numbers(rest, None, origin))
         if values.size < 7:
-            raise LayoutError(f"{origin}: expected p x y z, q w x y z, got {values.size} numbers")
+            raise DatasetError(f"{origin}: expected p x y z, q w x y z, got {values.size} numbers")
         orientation_xyzw = checked_orientation(values[[4, 5, 6, 3]], origin)
         pose_times_ns.append(int(time_ns))
         poses.append(Pose.from_xyzw(orientation_xyzw, values[:3]))

@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from vergence_proto.datasets.files import LayoutError, existing
+from vergence_proto.datasets.files import DatasetError, existing
 from vergence_proto.types import Plane
 
 _MAGIC = b"\x76\x2f\x31\x01"
@@ -29,15 +29,15 @@ _OPENCV_SWITCH = "OPENCV_IO_ENABLE_OPENEXR"
 def read_exr(path: Path) -> Plane:
     """Read the first of R, Y, G or whatever channel there is, float32 [H, W].
 
-    Raises LayoutError: missing, damaged, or of a kind that nothing here decodes.
+    Raises DatasetError: missing, damaged, or of a kind that nothing here decodes.
     """
     data = existing(path, "an OpenEXR file").read_bytes()
     if not data.startswith(_MAGIC):
-        raise LayoutError(f"{path}: expected OpenEXR, got a file starting {data[:4]!r}")
+        raise DatasetError(f"{path}: expected OpenEXR, got a file starting {data[:4]!r}")
     try:
         plane = _own_kind(data)
     except (KeyError, IndexError, ValueError, struct.error, zlib.error) as error:
-        raise LayoutError(f"{path}: a damaged OpenEXR file: {error}") from None
+        raise DatasetError(f"{path}: a damaged OpenEXR file: {error}") from None
     return _by_library(path) if plane is None else plane
 
 
@@ -125,7 +125,7 @@ def _by_library(path: Path) -> Plane:
     try:
         channels = openexr.File(str(path), separate_channels=True).channels()
     except (OSError, RuntimeError, ValueError) as error:
-        raise LayoutError(f"{path}: a damaged OpenEXR file: {error}") from None
+        raise DatasetError(f"{path}: a damaged OpenEXR file: {error}") from None
     return np.asarray(channels[_wanted(list(channels))].pixels, np.float32)
 
 
@@ -142,7 +142,7 @@ def _by_opencv(path: Path) -> Plane:
         else:
             os.environ[_OPENCV_SWITCH] = before
     if decoded is None:
-        raise LayoutError(
+        raise DatasetError(
             f"{path}: this kind of OpenEXR file needs the OpenEXR package, which is not "
             "installed: pip install OpenEXR"
         )

@@ -14,7 +14,7 @@ stand in.
 from functools import partial
 from pathlib import Path
 
-from vergence_proto.datasets.files import LayoutError
+from vergence_proto.datasets.files import DatasetError
 from vergence_proto.datasets.images import read_pfm
 from vergence_proto.datasets.listing import found, image_beside, images
 from vergence_proto.datasets.packings import known_offsets, nominal_rig, read_mask, size_of
@@ -26,7 +26,7 @@ _OWN_FX = 1050.0
 
 
 def find(root: Path) -> list[Path]:
-    """Every pair in or under ``root``, of either pass."""
+    """List every pair in or under ``root``, of either pass."""
     passes = [folder for name in _PASSES for folder in found(root, name)]
     if root.name in _PASSES:
         passes.append(root)
@@ -34,11 +34,14 @@ def find(root: Path) -> list[Path]:
 
 
 def open_path(path: Path) -> StereoSource:
-    """Raises LayoutError: a file is missing or wrong."""
+    """Open one pair.
+
+    Raises DatasetError: a file is missing or wrong.
+    """
     folder, number = path.parent, path.name
     left = image_beside(Path("any.png"), folder / "left", number)
     if folder.name not in _PASSES or not left.is_file():
-        raise LayoutError(
+        raise DatasetError(
             f"{path}: expected the number of an image in {' or '.join(_PASSES)}, as in "
             "image_clean/0000000"
         )

@@ -1,4 +1,4 @@
-"""Picture files, and the two file formats of disparity: 16-bit PNG (KITTI) and PFM."""
+"""Image files, and the two file formats of disparity: 16-bit PNG (KITTI) and PFM."""
 
 import re
 from pathlib import Path
@@ -9,52 +9,53 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vergence_proto.codec.images import decode_image
-from vergence_proto.datasets.files import LayoutError, existing
+from vergence_proto.datasets.files import DatasetError, existing
 from vergence_proto.errors import BadImage
 from vergence_proto.types import Image, Plane
 
-# KITTI's development kit: stored = disparity * 256, and 0 means none.
+# KITTI's development kit: stored = disparity * 256; 0 means no value.
 _PNG_STEPS_PER_PX = np.float32(256)
 _PFM_HEADER = re.compile(rb"(P[fF])\s+(\d+)\s+(\d+)\s+(-?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)\s")
 
 
 def read_image(path: Path) -> Image:
-    """Read uint8 [H, W, 3] RGB; grey is repeated.
+    """Read uint8 [H, W, 3] RGB; a grey image gets three equal channels.
 
-    Raises LayoutError: missing, damaged or cut short.
+    Raises DatasetError: the file is missing, damaged or cut short.
     """
     try:
         return decode_image(existing(path, "an image").read_bytes())
     except BadImage as error:
-        raise LayoutError(f"{path}: {error}") from None
+        raise DatasetError(f"{path}: {error}") from None
 
 
 def write_disparity_png(path: Path, disparity_px: Plane) -> None:
-    """Write what :func:`encode_disparity_png` makes."""
+    """Write the file that :func:`encode_disparity_png` encodes."""
     path.write_bytes(encode_disparity_png(disparity_px))
 
 
 def encode_disparity_png(disparity_px: Plane) -> bytes:
-    """Encode [H, W] pixels as 16-bit PNG, KITTI's convention: x256, 0 = none (NaN, 0, negative).
+    """Encode [H, W] pixels as 16-bit PNG in KITTI's convention: times 256, 0 = no value.
 
-    Below 1/256 px a value is kept as 1/256, above 255.99 it saturates.
+    NaN, 0 and negative numbers become "no value". Smaller positive values become 1/256 px, and
+    values above 255.99 px saturate.
     """
     scaled = np.fmax(disparity_px, 0) * _PNG_STEPS_PER_PX
     stored = np.clip(np.rint(scaled), scaled > 0, 65535).astype(np.uint16)
     done, file = cv2.imencode(".png", stored)
     if not done:
-        raise LayoutError(f"{stored.shape} does not fit a PNG")
+        raise DatasetError(f"{stored.shape} does not fit a PNG")
     return file.tobytes()
 
 
 def read_disparity_png(path: Path) -> Plane:
-    """Read what :func:`write_disparity_png` writes; NaN where there is none.
+    """Read what :func:`write_disparity_png` writes; NaN where there is no value.
 
-    Raises LayoutError: missing, damaged, or no 16-bit grey PNG.
+    Raises DatasetError: the file is missing, damaged, or no 16-bit grey PNG.
     """
     stored = read_stored_png(path)
     if stored.dtype != np.uint16 or stored.ndim != 2:
-        raise LayoutError(
+        raise DatasetError(
             f"{path}: expected a 16-bit grey PNG (disparity x256), "
             f"got {stored.dtype} {list(stored.shape)}"
         )
@@ -64,20 +65,20 @@ def read_disparity_png(path: Path) -> Plane:
 
 
 def read_stored_png(path: Path) -> NDArray[Any]:
-    """Read a PNG's numbers as they are stored, all channels.
+    """Read all channels of a PNG, with the numbers as they are stored.
 
-    Raises LayoutError: missing, damaged or cut short.
+    Raises DatasetError: the file is missing, damaged or cut short.
     """
     data = existing(path, "a PNG").read_bytes()
     try:
-        decode_image(data)  # for its checks
+        decode_image(data)  # raises if the file is damaged
     except BadImage as error:
-        raise LayoutError(f"{path}: {error}") from None
+        raise DatasetError(f"{path}: {error}") from None
     return np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED))
 
 
 def write_pfm(path: Path, values: Plane) -> None:
-    """Write what :func:`encode_pfm` makes."""
+    """Write the file that :func:`encode_pfm` encodes."""
     path.write_bytes(encode_pfm(values))
 
 
@@ -89,19 +90,19 @@ def encode_pfm(values: Plane) -> bytes:
 
 
 def read_pfm(path: Path) -> Plane:
-    """Read a one-channel PFM as float32 [H, W], top row first; what is not finite becomes NaN.
+    """Read a one-channel PFM as float32 [H, W], top row first; non-finite values become NaN.
 
-    Raises LayoutError: missing, no PFM, colour, or cut short.
+    Raises DatasetError: the file is missing, no PFM, a colour PFM, or cut short.
     """
     data = existing(path, "a PFM").read_bytes()
     header = _PFM_HEADER.match(data)
     if header is None:
-        raise LayoutError(f"{path}: expected a PFM, got a file starting {data[:16]!r}")
+        raise DatasetError(f"{path}: expected a PFM, got a file starting {data[:16]!r}")
     if header[1] == b"PF":
-        raise LayoutError(f"{path}: expected a one-channel PFM (Pf), got a colour one (PF)")
+        raise DatasetError(f"{path}: expected a one-channel PFM (Pf), got a colour one (PF)")
     width, height, scale = int(header[2]), int(header[3]), float(header[4])
     if len(data) - header.end() != 4 * width * height:
-        raise LayoutError(
+        raise DatasetError(
             f"{path}: {width}x{height} needs {4 * width * height} bytes after the header, "
             f"got {len(data) - header.end()}"
         )

@@ -20,7 +20,7 @@ _STEPS_PER_PX = 100.0
 
 
 def find(root: Path) -> list[Path]:
-    """Every pair in or under ``root``; by its truth, for left.png alone says too little."""
+    """List every pair in or under ``root``; by its truth, for left.png alone says too little."""
     return [
         path.parent
         for path in found(root, "left_disp.png")
@@ -29,7 +29,10 @@ def find(root: Path) -> list[Path]:
 
 
 def open_path(path: Path) -> StereoSource:
-    """Raises LayoutError: a file is missing or wrong."""
+    """Open one pair.
+
+    Raises DatasetError: a file is missing or wrong.
+    """
     left = existing(path / "left.png", "the left image of a pair")
     truth = path / "left_disp.png"
     pair = FrameFiles(

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from vergence_proto.datasets.exr import read_exr
-from vergence_proto.datasets.files import LayoutError
+from vergence_proto.datasets.files import DatasetError
 from vergence_proto.datasets.listing import found, image_beside, images
 from vergence_proto.datasets.packings import known_offsets, nominal_rig, size_of
 from vergence_proto.datasets.source import (
@@ -29,16 +29,19 @@ _BASELINE_M = 0.1
 
 
 def find(root: Path) -> list[Path]:
-    """Every scene in or under ``root``."""
+    """List every scene in or under ``root``."""
     folders = {path.parent for path in found(root, "l_*.png") if path.stem[2:].isdecimal()}
     return sorted(folder for folder in folders if images(folder, r"r_\d+"))
 
 
 def open_path(path: Path) -> StereoSource:
-    """Raises LayoutError: a file is missing or wrong."""
+    """Open one scene.
+
+    Raises DatasetError: a file is missing or wrong.
+    """
     lefts = images(path, r"l_\d+")
     if not lefts:
-        raise LayoutError(f"{path}: expected images l_1.png, l_2.png, found none")
+        raise DatasetError(f"{path}: expected images l_1.png, l_2.png, found none")
     size = size_of(lefts[0])
     own = size == _OWN_SIZE
     rig = nominal_rig(path, size)

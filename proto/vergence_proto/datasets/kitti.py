@@ -4,18 +4,18 @@
 
     ROOT/sequences/00/image_2 image_3       colour left and right, rectified (or image_0, image_1)
     ROOT/sequences/00/calib.txt             P0: to P3:, each a 3x4 projection
-    ROOT/sequences/00/times.txt             seconds, one a line
-    ROOT/poses/00.txt                       sequences 00 to 10: world_from_cam0, 3x4 a line
+    ROOT/sequences/00/times.txt             seconds, one per line
+    ROOT/poses/00.txt                       sequences 00 to 10: world_from_cam0, 3x4 per line
 
-Poses are those of the first grey camera; a colour camera stands beside it by K^-1 P[:, 3], which
-is composed in. There is no dense truth.
+The files state poses of the first grey camera. A colour camera is offset from it by K^-1 P[:, 3],
+which is composed into its poses. There is no dense truth.
 """
 
 from pathlib import Path
 
 import numpy as np
 
-from vergence_proto.datasets.files import LayoutError, numbers, read_text
+from vergence_proto.datasets.files import DatasetError, numbers, read_text
 from vergence_proto.datasets.images import read_image
 from vergence_proto.datasets.poses import read_matrix_poses
 from vergence_proto.datasets.source import FrameFiles, StereoSource, nominal_ns, rectified_rig
@@ -28,7 +28,7 @@ _GREY = (0, 1)
 
 
 def find(root: Path) -> list[Path]:
-    """Every sequence in or under ``root``."""
+    """List every sequence in or under ``root``."""
     return sorted(
         path.parent
         for path in root.rglob("calib.txt")
@@ -37,12 +37,15 @@ def find(root: Path) -> list[Path]:
 
 
 def open_path(path: Path) -> StereoSource:
-    """Raises LayoutError: a file is missing or wrong; calibration and poses are read at once."""
+    """Open one sequence; calibration and poses are read now.
+
+    Raises DatasetError: a file is missing or wrong.
+    """
     left, right = _COLOUR if (path / f"image_{_COLOUR[0]}").is_dir() else _GREY
     projections = read_projections(path / "calib.txt", "P{}:", (left, right))
     names = sorted(file.name for file in (path / f"image_{left}").glob("*.png"))
     if not names:
-        raise LayoutError(f"{path}: expected PNG images in image_{_COLOUR[0]} or image_{_GREY[0]}")
+        raise DatasetError(f"{path}: expected PNG images in image_{_COLOUR[0]} or image_{_GREY[0]}")
     times_ns = _times_ns(path / "times.txt", len(names))
     trajectory = path.parent.parent / "poses" / f"{path.name}.txt"
     left_from_cam0 = Pose(np.eye(3), _offset_m(projections[0]))
@@ -50,7 +53,7 @@ def open_path(path: Path) -> StereoSource:
     if trajectory.exists():
         poses = [each @ left_from_cam0.inverse() for each in read_matrix_poses(trajectory)]
     if len(poses) != len(names):
-        raise LayoutError(f"{trajectory}: expected {len(names)} poses, got {len(poses)}")
+        raise DatasetError(f"{trajectory}: expected {len(names)} poses, got {len(poses)}")
     files = [
         FrameFiles(path / f"image_{left}" / name, path / f"image_{right}" / name, time_ns, pose)
         for name, time_ns, pose in zip(names, times_ns, poses, strict=True)
@@ -61,9 +64,10 @@ def open_path(path: Path) -> StereoSource:
 
 
 def read_projections(path: Path, label: str, cameras: tuple[int, int]) -> tuple[Matrix, Matrix]:
-    """Read two 3x4 projections, in the lines that ``label`` with the camera's number starts.
+    """Read two 3x4 projections from the lines that start with ``label`` and the camera's number.
 
-    Raises LayoutError: missing file or line, not 12 numbers, or no projection.
+    Raises DatasetError: the file or a line is missing, a line does not have 12 numbers, or they
+    are no projection.
     """
     lines = dict(
         line.split(maxsplit=1)
@@ -74,10 +78,10 @@ def read_projections(path: Path, label: str, cameras: tuple[int, int]) -> tuple[
     for camera in cameras:
         name = label.format(camera)
         if name not in lines:
-            raise LayoutError(f"{path}: expected a line {name} with 12 numbers, found none")
+            raise DatasetError(f"{path}: expected a line {name} with 12 numbers, found none")
         projection = np.reshape(numbers(lines[name], 12, f"{path}, {name}"), (3, 4))
         if not (projection[0, 0] > 0 and np.linalg.det(projection[:, :3]) > 0):
-            raise LayoutError(f"{path}, {name}: expected K [I | t], got {projection.tolist()}")
+            raise DatasetError(f"{path}, {name}: expected K [I | t], got {projection.tolist()}")
         found.append(projection)
     return found[0], found[1]
 
@@ -85,9 +89,9 @@ def read_projections(path: Path, label: str, cameras: tuple[int, int]) -> tuple[
 def rig_from_projections(
     origin: Path, projections: tuple[Matrix, Matrix], size: tuple[int, int]
 ) -> StereoRig:
-    """The rectified rig of two KITTI projections; ``size`` is (width, height).
+    """Make a rectified rig from two KITTI projections; ``size`` is (width, height).
 
-    Raises LayoutError: the right camera is not to the right of the left one.
+    Raises DatasetError: the right camera is not to the right of the left one.
     """
     left, right = projections
     return rectified_rig(
@@ -103,12 +107,12 @@ def rig_from_projections(
 
 
 def _offset_m(projection: Matrix) -> Matrix:
-    """Where cam0's origin is in the camera of P = K [I | t]: t = K^-1 P[:, 3]."""
+    """Return cam0's origin in the coordinates of the camera of P = K [I | t]: t = K^-1 P[:, 3]."""
     return np.linalg.solve(projection[:, :3], projection[:, 3]).astype(np.float64)
 
 
 def _times_ns(path: Path, count: int) -> list[int]:
     if not path.exists():
         return [nominal_ns(index, _FPS) for index in range(count)]
-    times_s = numbers(read_text(path, "seconds, one a line"), count, str(path))
+    times_s = numbers(read_text(path, "seconds, one per line"), count, str(path))
     return [round(time_s * 1e9) for time_s in times_s]

@@ -1,15 +1,15 @@
-"""KITTI stereo 2012 and 2015: lone pairs with LiDAR truth.
+"""KITTI stereo 2012 and 2015: single pairs with LiDAR truth.
 
-``kitti2012:ROOT/training/000046`` and ``kitti2015:ROOT/training/000046``: the number is that of
-the files, no folder of the name exists::
+A source is named ``kitti2012:ROOT/training/000046`` or ``kitti2015:ROOT/training/000046``. The
+number is part of the files' names; there is no folder of that name::
 
     2012  image_0 image_1/%06d_10.png   disp_occ disp_noc/%06d_10.png
           calib/%06d.txt                P0: P1:
     2015  image_2 image_3/%06d_10.png   disp_occ_0 disp_noc_0/%06d_10.png
           calib_cam_to_cam/%06d.txt     P_rect_02: P_rect_03:
 
-Of 2012 the grey images are read, because its truth is that of the grey cameras. The testing half
-has no truth.
+In 2012 the grey images are read, because the truth belongs to the grey cameras. The testing half
+of both has no truth.
 """
 
 from dataclasses import dataclass
@@ -47,22 +47,22 @@ _2015 = _Edition(
 
 
 def find_2012(root: Path) -> list[Path]:
-    """Every pair in or under ``root``."""
+    """List every pair in or under ``root``."""
     return _find(root, _2012)
 
 
 def find_2015(root: Path) -> list[Path]:
-    """Every pair in or under ``root``."""
+    """List every pair in or under ``root``."""
     return _find(root, _2015)
 
 
 def open_2012(path: Path) -> StereoSource:
-    """Raises LayoutError: a file is missing or wrong."""
+    """Open one pair. Raises DatasetError: a file is missing or wrong."""
     return _open(path, _2012)
 
 
 def open_2015(path: Path) -> StereoSource:
-    """Raises LayoutError: a file is missing or wrong."""
+    """Open one pair. Raises DatasetError: a file is missing or wrong."""
     return _open(path, _2015)
 
 

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vergence_proto.datasets.files import LayoutError, numbers
+from vergence_proto.datasets.files import DatasetError, numbers
 from vergence_proto.datasets.kitti import rig_from_projections
 from vergence_proto.datasets.listing import (
     found,
@@ -43,17 +43,20 @@ _OXTS_FIELDS = 30
 
 
 def find(root: Path) -> list[Path]:
-    """Every drive in or under ``root``."""
+    """List every drive in or under ``root``."""
     folders = (found(root, f"image_{left}/data") for left in (_COLOUR[0], _GREY[0]))
     return sorted({folder.parents[1] for each in folders for folder in each if folder.is_dir()})
 
 
 def open_path(path: Path) -> StereoSource:
-    """Raises LayoutError: a file is missing or wrong; calibration and poses are read at once."""
+    """Open one drive; calibration and poses are read now.
+
+    Raises DatasetError: a file is missing or wrong.
+    """
     left, right = _COLOUR if (path / f"image_{_COLOUR[0]}").is_dir() else _GREY
     lefts = images(path / f"image_{left}" / "data", r"\d+")
     if not lefts:
-        raise LayoutError(
+        raise DatasetError(
             f"{path}: expected images in image_{_COLOUR[0]}/data or image_{_GREY[0]}/data"
         )
     size = size_of(lefts[0])
@@ -92,7 +95,7 @@ def _read_cameras(path: Path, left: str, right: str) -> tuple[Matrix, Matrix, Ma
     read = read_keyed(path, "KITTI's cameras", **wanted)
     for key, count in wanted.items():
         if key not in read:
-            raise LayoutError(f"{path}: expected a line {key}: with {count} numbers, found none")
+            raise DatasetError(f"{path}: expected a line {key}: with {count} numbers, found none")
     first, second = (np.reshape(read[f"P_rect_{each}"], (3, 4)) for each in (left, right))
     return first, second, np.reshape(read["R_rect_00"], (3, 3))
 
@@ -115,7 +118,7 @@ def _imu_from_left(calib: Path, cameras: tuple[Matrix, Matrix, Matrix]) -> Pose 
 def _read_transform(path: Path) -> Pose:
     read = read_keyed(path, "R: and T:", R=9, T=3)
     if "R" not in read or "T" not in read:
-        raise LayoutError(f"{path}: expected lines R: and T:, got {', '.join(read) or 'none'}")
+        raise DatasetError(f"{path}: expected lines R: and T:, got {', '.join(read) or 'none'}")
     matrix = np.column_stack([np.reshape(read["R"], (3, 3)), read["T"]])
     return checked_pose(matrix, str(path))
 
@@ -174,7 +177,7 @@ def _read_times(path: Path) -> list[int]:
             time = datetime.datetime.fromisoformat(whole).replace(tzinfo=datetime.UTC)
             nanoseconds = int(fraction.ljust(9, "0")[:9] or 0)
         except ValueError:
-            raise LayoutError(f"{path}: expected a date and time, got {line!r}") from None
+            raise DatasetError(f"{path}: expected a date and time, got {line!r}") from None
         times_ns.append(int(time.timestamp()) * 1_000_000_000 + nanoseconds)
     return times_ns
 
@@ -182,5 +185,5 @@ def _read_times(path: Path) -> list[int]:
 def _truth(path: Path, px_m: float) -> Truth:
     stored = read_grey(path)
     if stored.dtype != np.uint16:
-        raise LayoutError(f"{path}: expected a 16-bit PNG (metres x256), got {stored.dtype}")
+        raise DatasetError(f"{path}: expected a 16-bit PNG (metres x256), got {stored.dtype}")
     return Truth(offsets_from_depth(stored / _DEPTH_STEPS_PER_M, px_m))

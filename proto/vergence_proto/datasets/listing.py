@@ -8,13 +8,13 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-from vergence_proto.datasets.files import LayoutError, existing, numbers
+from vergence_proto.datasets.files import DatasetError, existing, numbers
 
 IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".ppm", ".pgm")
 
 
 def found(root: Path, pattern: str) -> list[Path]:
-    """Every data file or folder in or under ``root`` that matches ``pattern``, sorted."""
+    """List every data file or folder in or under ``root`` that matches ``pattern``, sorted."""
     return sorted(path for path in root.rglob(pattern) if _is_data(path.relative_to(root)))
 
 
@@ -45,30 +45,30 @@ def image_beside(path: Path, folder: Path, name: str) -> Path:
 def number_in(path: Path) -> int:
     """The last number in a file's name.
 
-    Raises LayoutError: there is none.
+    Raises DatasetError: there is none.
     """
     digits = re.findall(r"\d+", path.stem)
     if not digits:
-        raise LayoutError(f"{path}: expected a name with a frame number, got {path.name!r}")
+        raise DatasetError(f"{path}: expected a name with a frame number, got {path.name!r}")
     return int(digits[-1])
 
 
 def read_lines(path: Path, purpose: str) -> list[str]:
     """Read the lines that are not blank.
 
-    Raises LayoutError: there is no such file, or it is not text.
+    Raises DatasetError: there is no such file, or it is not text.
     """
     try:
         text = existing(path, purpose).read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise LayoutError(f"{path}: expected text, {purpose}") from None
+        raise DatasetError(f"{path}: expected text, {purpose}") from None
     return [line.strip() for line in text.splitlines() if line.strip()]
 
 
 def read_rows(path: Path, count: int, purpose: str) -> list[list[float]]:
     """Read ``count`` numbers a line; a first line of words is a heading.
 
-    Raises LayoutError: no such file, a line of words, or another count.
+    Raises DatasetError: no such file, a line of words, or another count.
     """
     lines = read_lines(path, purpose)
     heading = bool(lines) and lines[0][0].isalpha()
@@ -82,7 +82,7 @@ def read_rows(path: Path, count: int, purpose: str) -> list[list[float]]:
 def read_keyed(path: Path, purpose: str, **counts: int) -> Mapping[str, list[float]]:
     """Read the lines ``KEY: numbers`` of the named keys; a key without a line is left out.
 
-    Raises LayoutError: no such file, or another count of numbers.
+    Raises DatasetError: no such file, or another count of numbers.
     """
     keyed = {}
     for line in read_lines(path, purpose):

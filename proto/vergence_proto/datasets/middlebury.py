@@ -5,7 +5,7 @@
     im0.png im1.png
     calib.txt                     cam0=[f 0 cx; 0 f cy; 0 0 1], doffs, baseline (mm), width, height
     disp0.pfm or disp0GT.pfm      pixel offset u_left - u_right; +inf unknown
-    mask0nocc.png                 MiddEval3: 255 seen by both, 128 occluded, 0 unknown
+    mask0nocc.png                 MiddEval3: 255 visible in both, 128 occluded, 0 unknown
 
 Z = f * baseline / (d + doffs), where doffs = cx1 - cx0.
 """
@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vergence_proto.datasets.files import LayoutError, numbers, read_text
+from vergence_proto.datasets.files import DatasetError, numbers, read_text
 from vergence_proto.datasets.images import read_pfm, read_stored_png
 from vergence_proto.datasets.source import FrameFiles, StereoSource, Truth, rectified_rig
 from vergence_proto.types import StereoRig
@@ -26,19 +26,22 @@ _VISIBLE = 255
 
 
 def find(root: Path) -> list[Path]:
-    """Every scene in or under ``root``."""
+    """List every scene in or under ``root``."""
     return sorted(
         path.parent for path in root.rglob("calib.txt") if (path.parent / "im0.png").exists()
     )
 
 
 def open_path(path: Path) -> StereoSource:
-    """Raises LayoutError: a file is missing or wrong."""
+    """Open one scene. Raises DatasetError: a file is missing or wrong."""
     return open_scene(path, truth_folder=path)
 
 
 def open_scene(path: Path, *, truth_folder: Path) -> StereoSource:
-    """Raises LayoutError: a file is missing or wrong."""
+    """Open a scene whose truth is in another folder.
+
+    Raises DatasetError: a file is missing or wrong.
+    """
     names = (truth_folder / name for name in ("disp0.pfm", "disp0GT.pfm"))
     truth = next((each for each in names if each.exists()), None)
     pair = FrameFiles(
@@ -55,7 +58,7 @@ def _rig(path: Path) -> StereoRig:
     values = dict(line.split("=", 1) for line in text.splitlines() if "=" in line)
     for key in ("cam0", "baseline", "width", "height"):
         if key not in values:
-            raise LayoutError(f"{path}: expected a line {key}=..., found none")
+            raise DatasetError(f"{path}: expected a line {key}=..., found none")
 
     def number(key: str) -> float:
         return numbers(values[key], 1, f"{path}, {key}")[0]
@@ -80,5 +83,5 @@ def _truth(path: Path, mask_path: Path) -> Truth:
         return Truth(offset_px)
     mask = read_stored_png(mask_path)
     if mask.ndim != 2:
-        raise LayoutError(f"{mask_path}: expected a grey PNG, got {list(mask.shape)}")
+        raise DatasetError(f"{mask_path}: expected a grey PNG, got {list(mask.shape)}")
     return Truth(offset_px, visible=np.asarray(mask == _VISIBLE))

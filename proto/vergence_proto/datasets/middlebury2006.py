@@ -18,7 +18,7 @@ nominal, and lengths are metres only at full size with a dmin.txt.
 from functools import partial
 from pathlib import Path
 
-from vergence_proto.datasets.files import LayoutError, numbers
+from vergence_proto.datasets.files import DatasetError, numbers
 from vergence_proto.datasets.listing import found, image_beside, read_lines
 from vergence_proto.datasets.packings import nominal_rig, read_scaled, size_of
 from vergence_proto.datasets.source import FrameFiles, StereoSource, Truth, rectified_rig
@@ -31,23 +31,26 @@ _BASELINE_M = 0.16
 
 
 def find(root: Path) -> list[Path]:
-    """Every scene in or under ``root``."""
+    """List every scene in or under ``root``."""
     lefts = (path for left, _, _ in _VIEWS for path in found(root, f"{left}.*"))
     return sorted({path.parent for path in lefts if _images(path.parent) is not None})
 
 
 def open_path(path: Path, *, scale: float | None = None) -> StereoSource:
-    """Raises LayoutError: a file is missing or wrong, or ``scale`` is needed and not given."""
+    """Open one pair.
+
+    Raises DatasetError: a file is missing or wrong, or ``scale`` is needed and not given.
+    """
     views = _images(path)
     if views is None:
-        raise LayoutError(f"{path}: expected view1.png and view5.png, or im2.png and im6.png")
+        raise DatasetError(f"{path}: expected view1.png and view5.png, or im2.png and im6.png")
     left, right, truth_name = views
     scene = path.parents[1] if path.name.startswith("Exp") and len(path.parents) > 1 else path
     truth = image_beside(left, scene, truth_name)
     size = size_of(left)
     scale = scale or _scale(path, left, size)
     if scale is None and truth.is_file():
-        raise LayoutError(
+        raise DatasetError(
             f"{path}: images of {size[0]}x{size[1]} have none of the data set's own sizes, so the "
             f"scale of {truth.name} is unknown; add it: middlebury2006:{path}?scale=N"
         )

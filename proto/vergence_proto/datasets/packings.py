@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vergence_proto.datasets.files import LayoutError, existing
+from vergence_proto.datasets.files import DatasetError, existing
 from vergence_proto.datasets.images import read_image, read_stored_png
 from vergence_proto.datasets.source import Mask, rectified_rig
 from vergence_proto.types import Plane, StereoRig
@@ -18,7 +18,7 @@ _NOMINAL_BASELINE_M = 0.1
 def size_of(path: Path) -> tuple[int, int]:
     """Width and height of an image.
 
-    Raises LayoutError: it is missing or damaged.
+    Raises DatasetError: it is missing or damaged.
     """
     height, width = read_image(path).shape[:2]
     return width, height
@@ -40,7 +40,7 @@ def nominal_rig(origin: Path, size: tuple[int, int]) -> StereoRig:
 def read_grey(path: Path) -> NDArray[Any]:
     """Read a one-channel PNG or PGM as it is stored; of a grey PNG in colour, one channel.
 
-    Raises LayoutError: missing, damaged or coloured.
+    Raises DatasetError: missing, damaged or coloured.
     """
     if path.suffix.lower() == ".png":
         stored = read_stored_png(path)
@@ -48,23 +48,23 @@ def read_grey(path: Path) -> NDArray[Any]:
         data = np.frombuffer(existing(path, "a grey image").read_bytes(), np.uint8)
         decoded = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
         if decoded is None:
-            raise LayoutError(f"{path}: expected a grey image, got {data.size} bytes of no image")
+            raise DatasetError(f"{path}: expected a grey image, got {data.size} bytes of no image")
         stored = np.asarray(decoded)
     if stored.ndim == 3 and all(np.array_equal(stored[..., 0], stored[..., k]) for k in (1, 2)):
         stored = stored[..., 0]
     if stored.ndim != 2:
-        raise LayoutError(f"{path}: expected a grey image, got {list(stored.shape)}")
+        raise DatasetError(f"{path}: expected a grey image, got {list(stored.shape)}")
     return stored
 
 
 def read_scaled(path: Path, steps_per_px: float, *, bits: int = 16) -> Plane:
     """Read a disparity that is stored times ``steps_per_px``; 0 is unknown.
 
-    Raises LayoutError: missing, damaged, or not of ``bits`` bits.
+    Raises DatasetError: missing, damaged, or not of ``bits`` bits.
     """
     stored = read_grey(path)
     if stored.dtype != np.dtype(f"uint{bits}"):
-        raise LayoutError(
+        raise DatasetError(
             f"{path}: expected a {bits}-bit grey image (disparity x{steps_per_px:g}), "
             f"got {stored.dtype}"
         )
@@ -76,7 +76,7 @@ def read_scaled(path: Path, steps_per_px: float, *, bits: int = 16) -> Plane:
 def read_mask(path: Path) -> Mask:
     """Where a grey image is not 0.
 
-    Raises LayoutError: missing, damaged or coloured.
+    Raises DatasetError: missing, damaged or coloured.
     """
     return np.asarray(read_grey(path) != 0)
 
@@ -84,15 +84,15 @@ def read_mask(path: Path) -> Mask:
 def read_npy(path: Path, purpose: str) -> NDArray[Any]:
     """Read a plane from an .npy.
 
-    Raises LayoutError: missing, damaged, or not [H, W].
+    Raises DatasetError: missing, damaged, or not [H, W].
     """
     existing(path, purpose)
     try:
         plane = np.load(path)
     except (ValueError, EOFError, OSError) as error:
-        raise LayoutError(f"{path}: no readable .npy: {error}") from None
+        raise DatasetError(f"{path}: no readable .npy: {error}") from None
     if plane.ndim != 2:
-        raise LayoutError(f"{path}: expected {purpose} [H, W], got {list(plane.shape)}")
+        raise DatasetError(f"{path}: expected {purpose} [H, W], got {list(plane.shape)}")
     return np.asarray(plane)
 
 

@@ -1,4 +1,4 @@
-"""Trajectories: checked where they are read, interpolated where cameras have other times."""
+"""Trajectories: read and checked, and interpolated to the times of the images."""
 
 import bisect
 from collections.abc import Sequence
@@ -7,22 +7,23 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from vergence_proto.datasets.files import LayoutError, numbers, read_text
+from vergence_proto.datasets.files import DatasetError, numbers, read_text
+from vergence_proto.errors import BadPose
 from vergence_proto.geometry import Matrix, Pose
 
-# Files print six digits, and some rotations were multiplied together in float32.
+# Files print six digits, and some rotations are products in float32.
 _ORTHONORMAL_TOLERANCE = 1e-3
 _UNIT_TOLERANCE = 1e-2
-# Across a longer hole a straight line says little about a head or a drone.
-_LONGEST_HOLE_NS = 100_000_000
+# Over a longer gap, a head or a drone may not move in a straight line.
+_LONGEST_GAP_NS = 100_000_000
 
 
 def read_matrix_poses(path: Path) -> list[Pose]:
-    """Read ``world_from_camera``, 12 numbers a line, row-major.
+    """Read ``world_from_camera``, 12 numbers per line, row-major.
 
-    Raises LayoutError: missing, a line that is no rigid transform.
+    Raises DatasetError: the file is missing, or a line is no rigid transform.
     """
-    text = read_text(path, "one 3x4 camera-to-world matrix a line")
+    text = read_text(path, "one 3x4 camera-to-world matrix per line")
     lines = [line for line in text.splitlines() if line.strip()]
     return [
         checked_pose(
@@ -34,12 +35,18 @@ def read_matrix_poses(path: Path) -> list[Pose]:
 
 
 def checked_pose(matrix: Matrix, origin: str) -> Pose:
-    """The pose of a [3, 4] or [4, 4] matrix. Raises LayoutError: it is no rigid transform."""
-    pose = Pose.from_matrix(matrix)
+    """Return the pose of a [3, 4] or [4, 4] matrix.
+
+    Raises DatasetError: the matrix is no rigid transform.
+    """
+    try:
+        pose = Pose.from_matrix(matrix)
+    except BadPose as wrong:
+        raise DatasetError(f"{origin}: {wrong}") from None
     error = np.abs(pose.rotation @ pose.rotation.T - np.eye(3)).max()
     rigid = error <= _ORTHONORMAL_TOLERANCE and np.linalg.det(pose.rotation) > 0
     if not (rigid and np.isfinite(pose.translation_m).all()):
-        raise LayoutError(
+        raise DatasetError(
             f"{origin}: expected a rotation (orthonormal, determinant +1) and a finite "
             f"translation, got {np.asarray(matrix)[:3].tolist()}"
         )
@@ -47,17 +54,17 @@ def checked_pose(matrix: Matrix, origin: str) -> Pose:
 
 
 def checked_orientation(xyzw: Matrix, origin: str) -> Matrix:
-    """The quaternion itself. Raises LayoutError: it is not of unit length, but for rounding."""
+    """Return the quaternion. Raises DatasetError: its length is not 1 within rounding."""
     length = float(np.linalg.norm(xyzw))
     if not abs(length - 1) <= _UNIT_TOLERANCE:  # NaN fails here too
-        raise LayoutError(f"{origin}: expected a unit quaternion, got length {length:.6g}")
+        raise DatasetError(f"{origin}: expected a unit quaternion, got length {length:.6g}")
     return xyzw
 
 
 def interpolated(times_ns: Sequence[int], poses: Sequence[Pose], time_ns: int) -> Pose | None:
-    """The pose at ``time_ns`` on the way between its neighbours; None outside, or in a hole.
+    """Interpolate the pose at ``time_ns``; None before, after or in a gap of the trajectory.
 
-    ``times_ns`` ascends. Rotations turn at constant speed (slerp), positions go straight.
+    ``times_ns`` ascends. Rotation is interpolated by slerp, position linearly.
     """
     after = bisect.bisect_left(times_ns, time_ns)
     if after < len(times_ns) and times_ns[after] == time_ns:
@@ -65,7 +72,7 @@ def interpolated(times_ns: Sequence[int], poses: Sequence[Pose], time_ns: int) -
     if after in (0, len(times_ns)):
         return None
     start_ns, end_ns = times_ns[after - 1], times_ns[after]
-    if end_ns - start_ns > _LONGEST_HOLE_NS:
+    if end_ns - start_ns > _LONGEST_GAP_NS:
         return None
     start, end = poses[after - 1], poses[after]
     share = (time_ns - start_ns) / (end_ns - start_ns)

@@ -1,14 +1,14 @@
-"""SceneFlow (FlyingThings3D, Driving, Monkaa) and what was rendered in its format (XR-Stereo).
+"""SceneFlow (FlyingThings3D, Driving, Monkaa), and others in its format (XR-Stereo).
 
-``sceneflow:ROOT/frames_finalpass/TRAIN/A/0000``, with ``?fx=PIXELS`` for images that are neither
-SceneFlow's own 960x540 nor come with their intrinsics, as our benchmark's do::
+A source is named ``sceneflow:ROOT/frames_finalpass/TRAIN/A/0000``. Add ``?fx=PIXELS`` for images
+that are not SceneFlow's own 960x540 and have no ``intrinsics.json`` (our benchmark's have one)::
 
     ROOT/frames_cleanpass|frames_finalpass/REST/left right   %04d.png or .webp
     ROOT/disparity/REST/left                                 %04d.pfm, positive pixels
-    ROOT/camera_data/REST/camera_data.txt                    "Frame N", then L and R: 4x4 a line
+    ROOT/camera_data/REST/camera_data.txt                    "Frame N", then L and R: 4x4 per line
 
-Camera-to-world matrices have Blender's camera axes: x right, y up, z back. The world stays
-Blender's. SceneFlow states lengths in units of its own.
+Camera-to-world matrices have Blender's camera axes: x right, y up, z back. World axes are
+Blender's. SceneFlow states lengths in units of its own, not in metres.
 """
 
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from vergence_proto.datasets.files import (
-    LayoutError,
+    DatasetError,
     numbers,
     object_number,
     read_object,
@@ -44,15 +44,15 @@ _OPENCV_FROM_BLENDER_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def find(root: Path) -> list[Path]:
-    """Every sequence in or under ``root``, of either pass."""
+    """List every sequence of either pass in or under ``root``."""
     folders = sorted(left.parent for left in root.rglob("left") if left.is_dir())
     return [folder for folder in folders if any(part in _PASSES for part in folder.parts)]
 
 
 def open_path(path: Path, *, fx: float | None = None) -> StereoSource:
-    """Raises LayoutError: a file is missing or wrong, or ``fx`` (pixels) is needed and not given.
+    """Open one sequence. A frame that the camera data leaves out has no pose.
 
-    Frames that the camera data leaves out have no pose.
+    Raises DatasetError: a file is missing or wrong, or ``fx`` (pixels) is needed and not given.
     """
     disparity, specular = (_beside(path, kind) / "left" for kind in ("disparity", "specular"))
     origin = _beside(path, "camera_data") / "camera_data.txt"
@@ -63,7 +63,7 @@ def open_path(path: Path, *, fx: float | None = None) -> StereoSource:
         if each.suffix in _IMAGES and each.stem.isdecimal()
     )
     if not images:
-        raise LayoutError(f"{path / 'left'}: expected images %04d.png or .webp, found none")
+        raise DatasetError(f"{path / 'left'}: expected images %04d.png or .webp, found none")
     height, width = read_image(images[0]).shape[:2]
     own = (width, height) == _OWN_SIZE
     fps = None
@@ -73,12 +73,12 @@ def open_path(path: Path, *, fx: float | None = None) -> StereoSource:
         fx = fx or object_number(intrinsics, known, "fx")
         fps = object_number(intrinsics, known, "fps")
         if fps <= 0:
-            raise LayoutError(f"{intrinsics}: expected a positive fps, got {fps}")
+            raise DatasetError(f"{intrinsics}: expected a positive fps, got {fps}")
         own = False
     if fx is None and not own:
-        raise LayoutError(
-            f"{path}: images of {width}x{height} are not SceneFlow's own, and the layout states "
-            f"no focal length; add it: sceneflow:{path}?fx=PIXELS"
+        raise DatasetError(
+            f"{path}: images of {width}x{height} are not SceneFlow's own, and no file states "
+            f"the focal length; add it: sceneflow:{path}?fx=PIXELS"
         )
     first_left, first_right = next(iter(cameras.values()))
     rig = rectified_rig(
@@ -105,11 +105,11 @@ def open_path(path: Path, *, fx: float | None = None) -> StereoSource:
 
 
 def _beside(path: Path, kind: str) -> Path:
-    """The folder of another kind of data for the same sequence."""
+    """Return the folder with another kind of data of the same sequence."""
     for index, part in enumerate(path.parts):
         if part in _PASSES:
             return Path(*path.parts[:index], kind, *path.parts[index + 1 :])
-    raise LayoutError(f"{path}: expected a sequence under {' or '.join(_PASSES)}")
+    raise DatasetError(f"{path}: expected a sequence under {' or '.join(_PASSES)}")
 
 
 def _own_fx(path: Path) -> float:
@@ -117,18 +117,18 @@ def _own_fx(path: Path) -> float:
 
 
 def _read_cameras(path: Path) -> Mapping[int, tuple[Pose, Pose]]:
-    """Frame number -> world_from_left, world_from_right, OpenCV camera axes."""
+    """Map frame number to world_from_left and world_from_right, OpenCV camera axes."""
     cameras: dict[int, tuple[Pose, Pose]] = {}
     blocks = read_text(path, "SceneFlow's camera data").split("Frame")[1:]
     for block in blocks:
         lines = [line.split(maxsplit=1) for line in block.splitlines() if line.strip()]
         if [line[0] for line in lines[1:]] != ["L", "R"] or not lines[0][0].isdecimal():
-            raise LayoutError(f"{path}: expected 'Frame N', 'L ...', 'R ...', got {block[:60]!r}")
+            raise DatasetError(f"{path}: expected 'Frame N', 'L ...', 'R ...', got {block[:60]!r}")
         number = int(lines[0][0])
         left, right = (_pose(line[-1], f"{path}, frame {number}") for line in lines[1:])
         cameras[number] = left, right
     if not cameras:
-        raise LayoutError(f"{path}: expected blocks of 'Frame N', found none")
+        raise DatasetError(f"{path}: expected blocks of 'Frame N', found none")
     return cameras
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vergence_proto.datasets.files import LayoutError, existing
+from vergence_proto.datasets.files import DatasetError, existing
 from vergence_proto.datasets.images import read_stored_png
 from vergence_proto.datasets.listing import found, images, number_in
 from vergence_proto.datasets.packings import nominal_rig, read_mask, size_of
@@ -41,7 +41,7 @@ _SAME_FOCAL = 1e-3  # share of a change that is a rounding and no zoom
 
 
 def find(root: Path) -> list[Path]:
-    """Every scene in or under ``root``, of either pass."""
+    """List every scene in or under ``root``, of either pass."""
     if root.parent.name in _PASSES:
         return [root] if images(root) else []
     passes = [root] if root.name in _PASSES else []
@@ -50,12 +50,15 @@ def find(root: Path) -> list[Path]:
 
 
 def open_path(path: Path) -> StereoSource:
-    """Raises LayoutError: a file is missing or wrong; cameras are read at once."""
+    """Open one scene; calibration and poses are read now.
+
+    Raises DatasetError: a file is missing or wrong.
+    """
     if path.parent.name not in _PASSES:
-        raise LayoutError(f"{path}: expected a scene in {' or '.join(_PASSES)}")
+        raise DatasetError(f"{path}: expected a scene in {' or '.join(_PASSES)}")
     lefts = images(path)
     if not lefts:
-        raise LayoutError(f"{path}: expected images frame_%04d.png, found none")
+        raise DatasetError(f"{path}: expected images frame_%04d.png, found none")
     split, scene = path.parent.parent, path.name
     right = path.parent.with_name(path.parent.name.replace("left", "right")) / scene
     cameras = {
@@ -97,7 +100,7 @@ def _read_camera(path: Path) -> tuple[Matrix, Pose]:
     """K and world_from_left."""
     data = existing(path, "Sintel's camera").read_bytes()
     if len(data) != _CAM_BYTES or struct.unpack_from("<f", data)[0] != _CAM_TAG:
-        raise LayoutError(
+        raise DatasetError(
             f"{path}: expected {_CAM_BYTES} bytes that start with the float {_CAM_TAG}, "
             f"got {len(data)} bytes starting {data[:4]!r}"
         )
@@ -110,7 +113,7 @@ def _truth(split: Path, name: Path) -> Truth:
     path = split / "disparities" / name
     stored = read_stored_png(path)
     if stored.dtype != np.uint8 or stored.ndim != 3 or stored.shape[2] != 3:
-        raise LayoutError(
+        raise DatasetError(
             f"{path}: expected disparity packed in RGB, 8 bits each, "
             f"got {stored.dtype} {list(stored.shape)}"
         )

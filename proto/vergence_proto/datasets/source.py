@@ -1,4 +1,4 @@
-"""What every reader gives: a stereo source, one frame after the other."""
+"""The stereo source that every reader returns, and its frames."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vergence_proto.datasets.files import LayoutError
+from vergence_proto.datasets.files import DatasetError
 from vergence_proto.datasets.images import read_image
 from vergence_proto.errors import BadCalibration
 from vergence_proto.geometry import Pose, RectifiedRig
@@ -15,34 +15,40 @@ from vergence_proto.types import Plane, PoseSample, StereoFrame, StereoRig
 
 Mask = NDArray[np.bool_]
 
-# Frames of a layout that states no times are taken to be a camera's usual 30 Hz apart, so that
-# nothing downstream sees a gap.
+# If a data set states no times, its frames are 1/30 s apart, as those of most cameras, so that
+# no stream takes the interval for a gap.
 NOMINAL_FPS = 30.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """What is known about the disparity of one frame."""
+    """The known disparity of one frame."""
 
-    offset_px: Plane  # u_left - u_right in the images, NaN where unknown
-    # Pixels to judge by. Left out: mirrors and metal, whose truth no camera can see.
+    offset_px: Plane
+    """float32 [H, W]: u_left - u_right in the images; NaN where it is unknown."""
     mask: Mask | None = None
-    visible: Mask | None = None  # what the right camera sees too, where the layout tells
+    """bool [H, W]: pixels to evaluate, without mirrors and metal, whose truth no camera sees."""
+    visible: Mask | None = None
+    """bool [H, W]: pixels that the right camera sees too; None if the data set does not say."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SourceFrame:
-    """One frame as read from disk, OpenCV axes, metres."""
+    """One frame as read from disk, with OpenCV axes and metres."""
 
     frame: StereoFrame
-    truth_px: Plane | None = None  # as Truth.offset_px
-    truth_mask: Mask | None = None  # as Truth.mask; all true where the layout tells nothing
+    """The decoded images, the time of capture, and the pose if there is one."""
+    truth_px: Plane | None = None
+    """float32 [H, W]: u_left - u_right in the images; NaN where it is unknown."""
+    truth_mask: Mask | None = None
+    """bool [H, W]: pixels to evaluate; all of them if the data set does not say."""
     visible: Mask | None = None
+    """bool [H, W]: pixels that the right camera sees too; None if the data set does not say."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameFiles:
-    """Where one frame lies on disk."""
+    """The files of one frame."""
 
     left: Path
     right: Path
@@ -53,22 +59,24 @@ class FrameFiles:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StereoSource:
-    """A sequence, or a lone pair as one of length 1. Frames are read as they are asked for.
+    """A sequence, or a single pair as a sequence of length 1. Each frame is read when it is used.
 
-    Raises LayoutError from reading: an image that is missing, damaged, or not of the rig's size.
+    Reading a frame raises DatasetError: an image is missing, damaged, or not of the rig's size.
     """
 
     name: str
     rig: StereoRig
-    fps: float | None  # None: a pair, or times unknown
+    fps: float | None
+    """Frames per second; None for a single pair, or if the times are unknown."""
     files: Sequence[FrameFiles]
-    # False: lengths are not metres, because the calibration is unknown (and a nominal one stands
-    # in) or in units of the data set's own. Disparity is as good as ever.
+    """The files of each frame, in order."""
     metric: bool = True
+    """False if lengths are not metres, because the calibration is unknown (and a nominal one is
+    used) or in the data set's own units. Disparity is not affected."""
 
     @property
     def is_single_pair(self) -> bool:
-        """Whether this is one pair on its own and not one frame of a sequence."""
+        """True for a pair that is no frame of a sequence."""
         return self.fps is None and len(self) == 1
 
     def __len__(self) -> int:
@@ -87,9 +95,9 @@ class StereoSource:
             return SourceFrame(frame)
         truth = files.read_truth()
         if truth.offset_px.shape != left.shape[:2]:
-            raise LayoutError(
+            raise DatasetError(
                 f"{self.name}: the truth of frame {frame_id} is {truth.offset_px.shape[1]}x"
-                f"{truth.offset_px.shape[0]}, its image {left.shape[1]}x{left.shape[0]}"
+                f"{truth.offset_px.shape[0]}, but its image is {left.shape[1]}x{left.shape[0]}"
             )
         mask = np.ones(left.shape[:2], np.bool_) if truth.mask is None else truth.mask
         return SourceFrame(frame, truth.offset_px, mask, truth.visible)
@@ -98,7 +106,7 @@ class StereoSource:
         image = read_image(path)
         expected = (self.rig.left.height, self.rig.left.width)
         if image.shape[:2] != expected:
-            raise LayoutError(
+            raise DatasetError(
                 f"{path}: expected {expected[1]}x{expected[0]} as its calibration says, "
                 f"got {image.shape[1]}x{image.shape[0]}"
             )
@@ -116,9 +124,9 @@ def rectified_rig(
     fy: float | None = None,
     cx_right: float | None = None,
 ) -> StereoRig:
-    """A rectified rig of ``size`` (width, height).
+    """Make a rectified rig of ``size`` (width, height).
 
-    Raises LayoutError: the numbers that ``origin`` gave are no stereo rig.
+    Raises DatasetError: the numbers, read from ``origin``, are no stereo rig.
     """
     width, height = size
     try:
@@ -137,9 +145,9 @@ def rectified_rig(
             )
         )
     except BadCalibration as error:
-        raise LayoutError(f"{origin}: {error}") from None
+        raise DatasetError(f"{origin}: {error}") from None
 
 
 def nominal_ns(index: int, fps: float | None) -> int:
-    """When frame ``index`` was captured if frames are evenly spaced."""
+    """Return the time of frame ``index`` in a sequence with even spacing."""
     return round(index * 1e9 / (fps or NOMINAL_FPS))

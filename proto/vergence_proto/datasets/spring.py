@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vergence_proto.datasets.files import LayoutError, existing
+from vergence_proto.datasets.files import DatasetError, existing
 from vergence_proto.datasets.listing import found, image_beside, images, number_in, read_rows
 from vergence_proto.datasets.packings import nominal_rig, size_of
 from vergence_proto.datasets.poses import checked_pose
@@ -38,7 +38,7 @@ _SAME_FOCAL = 1e-3  # share of a change that is a rounding and no zoom
 
 
 def find(root: Path) -> list[Path]:
-    """Every sequence in or under ``root``."""
+    """List every sequence in or under ``root``."""
     return [
         folder.parent
         for folder in found(root, "frame_left")
@@ -47,10 +47,15 @@ def find(root: Path) -> list[Path]:
 
 
 def open_path(path: Path) -> StereoSource:
-    """Raises LayoutError: a file is missing or wrong; cameras are read at once."""
+    """Open one sequence; calibration and poses are read now.
+
+    Raises DatasetError: a file is missing or wrong.
+    """
     lefts = images(path / "frame_left", r"frame_left_\d+")
     if not lefts:
-        raise LayoutError(f"{path / 'frame_left'}: expected images frame_left_%04d.png, found none")
+        raise DatasetError(
+            f"{path / 'frame_left'}: expected images frame_left_%04d.png, found none"
+        )
     poses = _read_poses(path / "cam_data" / "extrinsics.txt")
     rig, metric = _read_rig(path / "cam_data" / "intrinsics.txt", size_of(lefts[0]))
     files = []
@@ -85,7 +90,7 @@ def _read_rig(path: Path, size: tuple[int, int]) -> tuple[StereoRig, bool]:
         return nominal_rig(path, size), False
     rows = read_rows(path, 4, "fx fy cx cy a line")
     if not rows:
-        raise LayoutError(f"{path}: expected fx fy cx cy a line, got an empty file")
+        raise DatasetError(f"{path}: expected fx fy cx cy a line, got an empty file")
     fx, fy, cx, cy = rows[0]
     rig = rectified_rig(path, size, fx=fx, fy=fy, cx=cx, cy=cy, baseline_m=_BASELINE_M)
     # One rig describes a whole source: of a zoom only the disparities stay right.
@@ -103,7 +108,7 @@ def _read_dsp5(path: Path) -> NDArray[Any]:
     try:
         h5py: Any = importlib.import_module("h5py")
     except ImportError:
-        raise LayoutError(
+        raise DatasetError(
             f"{path}: reading Spring's disparity needs h5py, which is not installed: "
             "pip install h5py"
         ) from None
@@ -111,7 +116,7 @@ def _read_dsp5(path: Path) -> NDArray[Any]:
         with h5py.File(path, "r") as file:
             stored = np.asarray(file["disparity"])
     except (OSError, KeyError) as error:
-        raise LayoutError(f"{path}: expected HDF5 with 'disparity': {error}") from None
+        raise DatasetError(f"{path}: expected HDF5 with 'disparity': {error}") from None
     if stored.ndim != 2:
-        raise LayoutError(f"{path}: expected disparity [H, W], got {list(stored.shape)}")
+        raise DatasetError(f"{path}: expected disparity [H, W], got {list(stored.shape)}")
     return stored

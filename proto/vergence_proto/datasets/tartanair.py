@@ -7,8 +7,9 @@
     2  image_lcam_front image_rcam_front/%06d_{l,r}cam_front.png  pose_lcam_front.txt
        depth_lcam_front/%06d_lcam_front_depth.png         640x640, float32 in the four bytes of RGBA
 
-Poses are "tx ty tz qx qy qz qw" a line, camera to world, north-east-down axes for both. Focal
-length 320 px, centre at half the size, baseline 0.25 m; no times are stated.
+Each line of poses is "tx ty tz qx qy qz qw", camera to world, with north-east-down axes for both.
+The focal length is 320 px, the centre is at half the size, the baseline is 0.25 m. The data set
+states no times.
 """
 
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vergence_proto.datasets.files import LayoutError, existing, numbers, read_text
+from vergence_proto.datasets.files import DatasetError, existing, numbers, read_text
 from vergence_proto.datasets.images import read_image, read_stored_png
 from vergence_proto.datasets.poses import checked_orientation
 from vergence_proto.datasets.source import (
@@ -38,7 +39,7 @@ _BASELINE_M = 0.25
 class _Version:
     left: str
     right: str
-    depth: str  # of the depth file: suffix after the number
+    depth: str  # a depth file's name after the number
 
     @property
     def poses(self) -> str:
@@ -52,19 +53,22 @@ _VERSIONS = (
 
 
 def find(root: Path) -> list[Path]:
-    """Every trajectory in or under ``root``."""
+    """List every trajectory in or under ``root``."""
     return sorted({path.parent for version in _VERSIONS for path in root.rglob(version.poses)})
 
 
 def open_path(path: Path) -> StereoSource:
-    """Raises LayoutError: a file is missing or wrong; all poses are read at once."""
+    """Open one trajectory; all poses are read now.
+
+    Raises DatasetError: a file is missing or wrong.
+    """
     version = next((each for each in _VERSIONS if (path / each.poses).exists()), None)
     if version is None:
-        raise LayoutError(f"{path}: expected {' or '.join(each.poses for each in _VERSIONS)}")
+        raise DatasetError(f"{path}: expected {' or '.join(each.poses for each in _VERSIONS)}")
     poses = _read_poses(path / version.poses)
     lefts = sorted((path / f"image_{version.left}").glob(f"*_{version.left}.png"))
     if not lefts or len(lefts) != len(poses):
-        raise LayoutError(
+        raise DatasetError(
             f"{path / version.poses}: expected a pose for each of {len(lefts)} images in "
             f"image_{version.left}, got {len(poses)}"
         )
@@ -83,7 +87,7 @@ def open_path(path: Path) -> StereoSource:
 
 
 def _read_poses(path: Path) -> list[Pose]:
-    lines = read_text(path, "tx ty tz qx qy qz qw a line").splitlines()
+    lines = read_text(path, "tx ty tz qx qy qz qw per line").splitlines()
     poses = []
     for number, line in enumerate((line for line in lines if line.strip()), start=1):
         origin = f"{path}, line {number}"
@@ -106,12 +110,12 @@ def _read_depth(path: Path) -> Plane:
     if path.suffix == ".png":
         stored = read_stored_png(path)
         if stored.dtype != np.uint8 or stored.ndim != 3 or stored.shape[2] != 4:
-            raise LayoutError(f"{path}: expected depth as an RGBA PNG, got {list(stored.shape)}")
+            raise DatasetError(f"{path}: expected depth as an RGBA PNG, got {list(stored.shape)}")
         return np.ascontiguousarray(stored).view("<f4")[..., 0].astype(np.float32)
     try:
         depth_m = np.load(path)
     except (ValueError, EOFError, OSError) as error:
-        raise LayoutError(f"{path}: no readable .npy: {error}") from None
+        raise DatasetError(f"{path}: expected a readable .npy: {error}") from None
     if depth_m.ndim != 2:
-        raise LayoutError(f"{path}: expected depth [H, W], got {list(depth_m.shape)}")
+        raise DatasetError(f"{path}: expected depth [H, W], got {list(depth_m.shape)}")
     return np.asarray(depth_m, np.float32)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vergence_proto.datasets.files import LayoutError
+from vergence_proto.datasets.files import DatasetError
 from vergence_proto.datasets.listing import found, image_beside, images, number_in, read_rows
 from vergence_proto.datasets.packings import nominal_rig, offsets_from_depth, read_grey, size_of
 from vergence_proto.datasets.poses import checked_pose
@@ -39,7 +39,7 @@ _FPS = 10.0  # KITTI's
 
 
 def find(root: Path) -> list[Path]:
-    """Every variation of a scene in or under ``root``."""
+    """List every variation of a scene in or under ``root``."""
     return [
         folder.parents[2]
         for folder in found(root, "Camera_0")
@@ -48,11 +48,14 @@ def find(root: Path) -> list[Path]:
 
 
 def open_path(path: Path) -> StereoSource:
-    """Raises LayoutError: a file is missing or wrong; cameras are read at once."""
+    """Open one variation of a scene; calibration and poses are read now.
+
+    Raises DatasetError: a file is missing or wrong.
+    """
     rgb = path / "frames" / "rgb"
     lefts = images(rgb / "Camera_0", r"rgb_\d+")
     if not lefts:
-        raise LayoutError(f"{rgb / 'Camera_0'}: expected images rgb_%05d.jpg, found none")
+        raise DatasetError(f"{rgb / 'Camera_0'}: expected images rgb_%05d.jpg, found none")
     text, depth = _archive(path, "textgt"), _archive(path, "depth") / "frames/depth/Camera_0"
     poses = _read_poses(text / "extrinsic.txt")
     rig, px_m = _read_rig(text / "intrinsic.txt", size_of(lefts[0]))
@@ -100,7 +103,7 @@ def _read_rig(path: Path, size: tuple[int, int]) -> tuple[StereoRig, float | Non
         rows = read_rows(path, 6, "frame, cameraID, fx, fy, cx, cy a line")
         lefts = [row[2:] for row in rows if row[1] == 0]
         if not lefts:
-            raise LayoutError(f"{path}: expected lines with cameraID 0, found none")
+            raise DatasetError(f"{path}: expected lines with cameraID 0, found none")
         fx, fy, cx, cy = lefts[0]
     elif size == _OWN_SIZE:
         fx, fy, cx, cy = _OWN_INTRINSICS
@@ -113,6 +116,6 @@ def _read_rig(path: Path, size: tuple[int, int]) -> tuple[StereoRig, float | Non
 def _truth(path: Path, px_m: float) -> Truth:
     stored = read_grey(path)
     if stored.dtype != np.uint16:
-        raise LayoutError(f"{path}: expected a 16-bit PNG of centimetres, got {stored.dtype}")
+        raise DatasetError(f"{path}: expected a 16-bit PNG of centimetres, got {stored.dtype}")
     depth_m = np.where(stored == _SKY, 0, stored / _STEPS_PER_M)
     return Truth(offsets_from_depth(depth_m, px_m))

@@ -3,7 +3,7 @@ from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
 from collections.abc import Iterable as _Iterable, Mapping as _Mapping
-from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
+from typing import Any as _Any, ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 
 DESCRIPTOR: _descriptor.FileDescriptor
 
@@ -119,7 +119,7 @@ class StreamDepthRequest(_message.Message):
     ping: Ping
     reset: Reset
     end: End
-    def __init__(self, open: _Optional[_Union[OpenStream, _Mapping]] = ..., frame: _Optional[_Union[Frame, _Mapping]] = ..., ping: _Optional[_Union[Ping, _Mapping]] = ..., reset: _Optional[_Union[Reset, _Mapping]] = ..., end: _Optional[_Union[End, _Mapping]] = ...) -> None: ...
+    def __init__(self, open: _Optional[_Union[OpenStream, _Mapping[str, _Any]]] = ..., frame: _Optional[_Union[Frame, _Mapping[str, _Any]]] = ..., ping: _Optional[_Union[Ping, _Mapping[str, _Any]]] = ..., reset: _Optional[_Union[Reset, _Mapping[str, _Any]]] = ..., end: _Optional[_Union[End, _Mapping[str, _Any]]] = ...) -> None: ...
 
 class StreamDepthResponse(_message.Message):
     __slots__ = ("opened", "disparity", "frame_error", "frames_dropped", "pong", "notice")
@@ -135,7 +135,7 @@ class StreamDepthResponse(_message.Message):
     frames_dropped: FramesDropped
     pong: Pong
     notice: Notice
-    def __init__(self, opened: _Optional[_Union[StreamOpened, _Mapping]] = ..., disparity: _Optional[_Union[DisparityMap, _Mapping]] = ..., frame_error: _Optional[_Union[FrameError, _Mapping]] = ..., frames_dropped: _Optional[_Union[FramesDropped, _Mapping]] = ..., pong: _Optional[_Union[Pong, _Mapping]] = ..., notice: _Optional[_Union[Notice, _Mapping]] = ...) -> None: ...
+    def __init__(self, opened: _Optional[_Union[StreamOpened, _Mapping[str, _Any]]] = ..., disparity: _Optional[_Union[DisparityMap, _Mapping[str, _Any]]] = ..., frame_error: _Optional[_Union[FrameError, _Mapping[str, _Any]]] = ..., frames_dropped: _Optional[_Union[FramesDropped, _Mapping[str, _Any]]] = ..., pong: _Optional[_Union[Pong, _Mapping[str, _Any]]] = ..., notice: _Optional[_Union[Notice, _Mapping[str, _Any]]] = ...) -> None: ...
 
 class OpenStream(_message.Message):
     __slots__ = ("stream_id", "resume_token", "rig", "axes", "delivery", "output", "iterations", "cold_iterations", "weights_sha256")
@@ -157,7 +157,7 @@ class OpenStream(_message.Message):
     iterations: int
     cold_iterations: int
     weights_sha256: str
-    def __init__(self, stream_id: _Optional[str] = ..., resume_token: _Optional[bytes] = ..., rig: _Optional[_Union[StereoRig, _Mapping]] = ..., axes: _Optional[_Union[Axes, str]] = ..., delivery: _Optional[_Union[Delivery, str]] = ..., output: _Optional[_Union[OutputFormat, _Mapping]] = ..., iterations: _Optional[int] = ..., cold_iterations: _Optional[int] = ..., weights_sha256: _Optional[str] = ...) -> None: ...
+    def __init__(self, stream_id: _Optional[str] = ..., resume_token: _Optional[bytes] = ..., rig: _Optional[_Union[StereoRig, _Mapping[str, _Any]]] = ..., axes: _Optional[_Union[Axes, str]] = ..., delivery: _Optional[_Union[Delivery, str]] = ..., output: _Optional[_Union[OutputFormat, _Mapping[str, _Any]]] = ..., iterations: _Optional[int] = ..., cold_iterations: _Optional[int] = ..., weights_sha256: _Optional[str] = ...) -> None: ...
 
 class StreamOpened(_message.Message):
     __slots__ = ("stream_id", "resume_token", "credit", "rig", "model", "resumed", "detach_grace_s", "idle_timeout_s", "last_frame_id")
@@ -179,7 +179,7 @@ class StreamOpened(_message.Message):
     detach_grace_s: float
     idle_timeout_s: float
     last_frame_id: int
-    def __init__(self, stream_id: _Optional[str] = ..., resume_token: _Optional[bytes] = ..., credit: _Optional[int] = ..., rig: _Optional[_Union[RectifiedRig, _Mapping]] = ..., model: _Optional[_Union[ModelInfo, _Mapping]] = ..., resumed: bool = ..., detach_grace_s: _Optional[float] = ..., idle_timeout_s: _Optional[float] = ..., last_frame_id: _Optional[int] = ...) -> None: ...
+    def __init__(self, stream_id: _Optional[str] = ..., resume_token: _Optional[bytes] = ..., credit: _Optional[int] = ..., rig: _Optional[_Union[RectifiedRig, _Mapping[str, _Any]]] = ..., model: _Optional[_Union[ModelInfo, _Mapping[str, _Any]]] = ..., resumed: bool = ..., detach_grace_s: _Optional[float] = ..., idle_timeout_s: _Optional[float] = ..., last_frame_id: _Optional[int] = ...) -> None: ...
 
 class Frame(_message.Message):
     __slots__ = ("frame_id", "capture_ns", "left", "right", "pose", "max_age_s")
@@ -195,7 +195,7 @@ class Frame(_message.Message):
     right: Image
     pose: PoseSample
     max_age_s: float
-    def __init__(self, frame_id: _Optional[int] = ..., capture_ns: _Optional[int] = ..., left: _Optional[_Union[Image, _Mapping]] = ..., right: _Optional[_Union[Image, _Mapping]] = ..., pose: _Optional[_Union[PoseSample, _Mapping]] = ..., max_age_s: _Optional[float] = ...) -> None: ...
+    def __init__(self, frame_id: _Optional[int] = ..., capture_ns: _Optional[int] = ..., left: _Optional[_Union[Image, _Mapping[str, _Any]]] = ..., right: _Optional[_Union[Image, _Mapping[str, _Any]]] = ..., pose: _Optional[_Union[PoseSample, _Mapping[str, _Any]]] = ..., max_age_s: _Optional[float] = ...) -> None: ...
 
 class Reset(_message.Message):
     __slots__ = ()
@@ -273,7 +273,7 @@ class DisparityMap(_message.Message):
     iterations: int
     frames_skipped: int
     timings: Timings
-    def __init__(self, frame_id: _Optional[int] = ..., capture_ns: _Optional[int] = ..., disparity: _Optional[_Union[Plane, _Mapping]] = ..., confidence: _Optional[_Union[Plane, _Mapping]] = ..., sigma: _Optional[_Union[Plane, _Mapping]] = ..., world_from_left: _Optional[_Union[Pose, _Mapping]] = ..., origin: _Optional[_Union[Origin, str]] = ..., step_count: _Optional[int] = ..., iterations: _Optional[int] = ..., frames_skipped: _Optional[int] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ...) -> None: ...
+    def __init__(self, frame_id: _Optional[int] = ..., capture_ns: _Optional[int] = ..., disparity: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., confidence: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., sigma: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., world_from_left: _Optional[_Union[Pose, _Mapping[str, _Any]]] = ..., origin: _Optional[_Union[Origin, str]] = ..., step_count: _Optional[int] = ..., iterations: _Optional[int] = ..., frames_skipped: _Optional[int] = ..., timings: _Optional[_Union[Timings, _Mapping[str, _Any]]] = ...) -> None: ...
 
 class Timings(_message.Message):
     __slots__ = ("decode_us", "queue_us", "model_us", "encode_us", "total_us")
@@ -359,7 +359,7 @@ class Pose(_message.Message):
     POSITION_M_FIELD_NUMBER: _ClassVar[int]
     orientation: Quaternion
     position_m: Vector3
-    def __init__(self, orientation: _Optional[_Union[Quaternion, _Mapping]] = ..., position_m: _Optional[_Union[Vector3, _Mapping]] = ...) -> None: ...
+    def __init__(self, orientation: _Optional[_Union[Quaternion, _Mapping[str, _Any]]] = ..., position_m: _Optional[_Union[Vector3, _Mapping[str, _Any]]] = ...) -> None: ...
 
 class PoseSample(_message.Message):
     __slots__ = ("world_from_left", "orientation_valid", "position_valid", "tracked")
@@ -371,7 +371,7 @@ class PoseSample(_message.Message):
     orientation_valid: bool
     position_valid: bool
     tracked: bool
-    def __init__(self, world_from_left: _Optional[_Union[Pose, _Mapping]] = ..., orientation_valid: bool = ..., position_valid: bool = ..., tracked: bool = ...) -> None: ...
+    def __init__(self, world_from_left: _Optional[_Union[Pose, _Mapping[str, _Any]]] = ..., orientation_valid: bool = ..., position_valid: bool = ..., tracked: bool = ...) -> None: ...
 
 class Camera(_message.Message):
     __slots__ = ("width", "height", "fx", "fy", "cx", "cy", "distortion", "coefficients")
@@ -401,7 +401,7 @@ class StereoRig(_message.Message):
     left: Camera
     right: Camera
     left_from_right: Pose
-    def __init__(self, left: _Optional[_Union[Camera, _Mapping]] = ..., right: _Optional[_Union[Camera, _Mapping]] = ..., left_from_right: _Optional[_Union[Pose, _Mapping]] = ...) -> None: ...
+    def __init__(self, left: _Optional[_Union[Camera, _Mapping[str, _Any]]] = ..., right: _Optional[_Union[Camera, _Mapping[str, _Any]]] = ..., left_from_right: _Optional[_Union[Pose, _Mapping[str, _Any]]] = ...) -> None: ...
 
 class RectifiedRig(_message.Message):
     __slots__ = ("width", "height", "fx", "fy", "cx_left", "cx_right", "cy", "baseline_m")
@@ -459,7 +459,7 @@ class GetServerInfoResponse(_message.Message):
     max_pixels: int
     engine: str
     instruction_set: str
-    def __init__(self, version: _Optional[str] = ..., model: _Optional[_Union[ModelInfo, _Mapping]] = ..., provider: _Optional[str] = ..., streams_open: _Optional[int] = ..., streams_max: _Optional[int] = ..., max_message_bytes: _Optional[int] = ..., max_pixels: _Optional[int] = ..., engine: _Optional[str] = ..., instruction_set: _Optional[str] = ...) -> None: ...
+    def __init__(self, version: _Optional[str] = ..., model: _Optional[_Union[ModelInfo, _Mapping[str, _Any]]] = ..., provider: _Optional[str] = ..., streams_open: _Optional[int] = ..., streams_max: _Optional[int] = ..., max_message_bytes: _Optional[int] = ..., max_pixels: _Optional[int] = ..., engine: _Optional[str] = ..., instruction_set: _Optional[str] = ...) -> None: ...
 
 class GetStreamRequest(_message.Message):
     __slots__ = ("stream_id",)
@@ -489,7 +489,7 @@ class GetStreamResponse(_message.Message):
     step_count: int
     idle_s: float
     state_bytes: int
-    def __init__(self, stream_id: _Optional[str] = ..., attached: bool = ..., rig: _Optional[_Union[RectifiedRig, _Mapping]] = ..., frames_stepped: _Optional[int] = ..., frames_dropped: _Optional[int] = ..., frames_failed: _Optional[int] = ..., last_frame_id: _Optional[int] = ..., step_count: _Optional[int] = ..., idle_s: _Optional[float] = ..., state_bytes: _Optional[int] = ...) -> None: ...
+    def __init__(self, stream_id: _Optional[str] = ..., attached: bool = ..., rig: _Optional[_Union[RectifiedRig, _Mapping[str, _Any]]] = ..., frames_stepped: _Optional[int] = ..., frames_dropped: _Optional[int] = ..., frames_failed: _Optional[int] = ..., last_frame_id: _Optional[int] = ..., step_count: _Optional[int] = ..., idle_s: _Optional[float] = ..., state_bytes: _Optional[int] = ...) -> None: ...
 
 class ResetStreamRequest(_message.Message):
     __slots__ = ("stream_id",)

@@ -1,4 +1,4 @@
-"""Where messages of one attachment wait, between Zenoh's threads and the event loop."""
+"""A queue for the messages of one attachment, from Zenoh's threads to the event loop."""
 
 import asyncio
 import threading
@@ -13,7 +13,7 @@ from vergence_proto.errors import Quota
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.zenoh.keys import encoding_of
 
-# Everything but images and maps is small, and comes about once for each of those.
+# All messages except images and maps are small, and about one of them comes with each of those.
 _SMALL_MESSAGES = 256
 
 _TYPES: dict[str, type[Message]] = {
@@ -31,21 +31,20 @@ _TYPES: dict[str, type[Message]] = {
 
 
 class Inbox:
-    """Messages in the order they came, decoded when they are taken.
+    """Messages in the order of their arrival, decoded when they are taken.
 
-    Of those of type ``bulky`` at most ``room`` wait. One more displaces the oldest of them if
-    ``displaces``: with a room of one, that is Zenoh's ring channel of one, but for the other
-    messages, which keep their place between the bulky ones. Otherwise it is the end: the sender
-    has broken the rule of credit.
+    At most ``max_bulky`` messages of type ``bulky`` wait. If one more arrives and ``drop_oldest``
+    is set, the oldest bulky message is dropped; all other messages keep their place in the order.
+    Without ``drop_oldest`` the inbox ends with Quota, because the sender has exceeded its credit.
     """
 
     def __init__(
-        self, attachment_id: str, *, bulky: type[Message], room: int, displaces: bool
+        self, attachment_id: str, *, bulky: type[Message], max_bulky: int, drop_oldest: bool
     ) -> None:
         self._attachment_id = attachment_id.encode()
         self._bulky = encoding_of(bulky())
-        self._room = room
-        self._displaces = displaces
+        self._max_bulky = max_bulky
+        self._drop_oldest = drop_oldest
         self._waiting: deque[tuple[str, zenoh.ZBytes | Message]] = deque()
         self._lock = threading.Lock()
         self._loop = asyncio.get_running_loop()
@@ -53,7 +52,10 @@ class Inbox:
         self._end: Exception | None = None
 
     def put(self, sample: zenoh.Sample) -> None:
-        """Called in Zenoh's thread: copies nothing, and waits for nobody."""
+        """Add a message from Zenoh's thread, without a copy and without waiting.
+
+        Messages of another attachment are discarded.
+        """
         attachment, encoding = sample.attachment, str(sample.encoding)
         if attachment is None or attachment.to_bytes() != self._attachment_id:
             return
@@ -61,31 +63,34 @@ class Inbox:
         with self._lock:
             kinds = enumerate(kind == self._bulky for kind, _ in self._waiting)
             alike = [index for index, is_bulky in kinds if is_bulky == bulky]
-            if len(alike) < (self._room if bulky else _SMALL_MESSAGES):
+            if len(alike) < (self._max_bulky if bulky else _SMALL_MESSAGES):
                 self._waiting.append((encoding, sample.payload))
-            elif bulky and self._displaces:
+            elif bulky and self._drop_oldest:
                 del self._waiting[alike[0]]
                 self._waiting.append((encoding, sample.payload))
             else:
-                self._end = self._end or Quota("more messages wait than the credit allows")
+                self._end = self._end or Quota(
+                    "more messages wait than the credit allows; send only when answers arrive"
+                )
         with suppress(RuntimeError):  # the loop has closed before the session
             self._loop.call_soon_threadsafe(self._arrived.set)
 
-    def put_own(self, message: Message) -> None:
-        """Called in the event loop: a message that this end has for itself."""
+    def put_local(self, message: Message) -> None:
+        """Add a message that this side made itself, from the event loop."""
         with self._lock:
             self._waiting.append(("", message))
         self._arrived.set()
 
     def end(self, error: Exception) -> None:
-        """Nothing comes any more: raise this once what waits is taken."""
+        """Accept the end: :meth:`take` raises ``error`` once all waiting messages are taken."""
         self._end = self._end or error
         self._arrived.set()
 
     async def take(self) -> Message:
-        """The oldest message, waiting for one. Raises what it ended with.
+        """Remove and return the oldest message; wait until there is one.
 
-        What does not decode is passed over, as if it had been lost on the way.
+        A message that does not decode is discarded, as if the network had lost it.
+        Raises the error given to :meth:`end`, or Quota: too many messages wait.
         """
         while True:
             with self._lock:

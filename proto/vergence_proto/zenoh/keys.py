@@ -1,42 +1,44 @@
-"""Names that both sides spell the same way: gRPC metadata, Zenoh keys and encodings.
+"""Names on the wire that client and server share: gRPC metadata, Zenoh keys and encodings.
 
-Over Zenoh, under a namespace (``vergence`` unless told otherwise)::
+The Zenoh keys under a namespace ``NS``, by default ``vergence``::
 
-    NS/v1/@server/SERVER                liveliness: this server serves
-    NS/v1/@server/SERVER/open           query: OpenStream, answered StreamOpened
+    NS/v1/@server/SERVER                liveliness: this server is running
+    NS/v1/@server/SERVER/open           query: OpenStream; reply: StreamOpened
     NS/v1/@server/SERVER/info           query: GetServerInfoRequest
     NS/v1/@server/SERVER/stream         query: GetStreamRequest
     NS/v1/@server/SERVER/reset          query: ResetStreamRequest
     NS/v1/@server/SERVER/close          query: CloseStreamRequest
-    NS/v1/STREAM/@client/ATTACHMENT     liveliness: this client has the stream
+    NS/v1/STREAM/@client/ATTACHMENT     liveliness: this client is attached
     NS/v1/STREAM/frames                 up: Frame; between frames Ping, Reset and, last, End
     NS/v1/STREAM/disparity              down: DisparityMap
     NS/v1/STREAM/status                 down: StreamDepthResponse of every other kind; last, End
-                                        or the google.rpc.Status that the stream ends with
+                                        or the google.rpc.Status that ends the stream
 
-Every payload is a protobuf message whose type is the schema of its encoding. A query that fails
-is answered by an error whose payload is a google.rpc.Status. What belongs to one attachment of a
-client to a stream, from its open on, carries the attachment's id as Zenoh attachment, so that what
-an earlier one left on the way is told apart. A client is bound by its credit, and numbers the
-frames it sends without a gap: what is missing was lost on the way, and is answered as dropped.
+Every payload is a protobuf message, and the schema of its encoding names the message's type. The
+reply to a query that fails is an error whose payload is a google.rpc.Status.
 
-All go with real-time priority, so that none overtakes another; live frames, and the answers to
-them, are dropped where the way is full (congestion DROP), everything else waits (BLOCK).
+Each message carries its connection's id (as Zenoh attachment), so late messages of an earlier
+connection can be discarded. A client sends at most as many unanswered frames as its credit. It
+numbers its frames without a gap: a missing number was lost by the network and is answered as
+dropped.
 
-A chunk that begins with @ is matched by no wildcard, and no stream id has one.
+All messages have real-time priority, so none overtakes another. On a congested link, live frames
+and the answers to them are dropped (congestion control DROP); all other messages wait (BLOCK).
+
+No wildcard matches a chunk that begins with @, and no stream id contains that character.
 """
 
 from google.protobuf.message import Message
 
-# gRPC metadata of every StreamDepth call: a proxy in front of several servers hashes it, so that
-# a stream's frames always reach the server that holds its state.
+# gRPC metadata of every StreamDepth call. A proxy in front of several servers hashes it, so that
+# a stream's frames always reach the server that holds the stream's state.
 STREAM_ID_METADATA = "x-stream-id"
 
 DEFAULT_NAMESPACE = "vergence"
-ANY = "*"  # in place of one chunk
+ANY = "*"  # matches one chunk of a key
 
 OPEN = "open"
-# The unary methods of DepthService, by the last chunk of their key.
+# The last chunk of the key of each unary method of DepthService.
 UNARY_KEYS = {
     "GetServerInfo": "info",
     "GetStream": "stream",
@@ -48,31 +50,34 @@ _PROTOBUF = "application/protobuf"
 
 
 class StreamKeys:
-    """The keys of one stream."""
+    """The Zenoh keys of one stream."""
 
     def __init__(self, namespace: str, stream_id: str) -> None:
         self._stream = f"{namespace}/v1/{stream_id}"
-        self.frames = f"{self._stream}/frames"
-        self.disparity = f"{self._stream}/disparity"
-        self.status = f"{self._stream}/status"
+        self.frames: str = f"{self._stream}/frames"
+        self.disparity: str = f"{self._stream}/disparity"
+        self.status: str = f"{self._stream}/status"
 
     def client(self, attachment_id: str) -> str:
+        """Return the key of the token that shows that this attachment is alive."""
         return f"{self._stream}/@client/{attachment_id}"
 
 
 def server_key(namespace: str, server_id: str = ANY) -> str:
+    """Return the key of the token that shows that a server is running."""
     return f"{namespace}/v1/@server/{server_id}"
 
 
-def ask_key(namespace: str, server_id: str, what: str) -> str:
+def query_key(namespace: str, server_id: str, what: str) -> str:
+    """Return the key of a query; ``what`` is ``open`` or one of ``UNARY_KEYS``."""
     return f"{server_key(namespace, server_id)}/{what}"
 
 
 def server_of(key: str) -> str:
-    """The server's id, from a key of :func:`ask_key`."""
+    """Return the server's id from a key made by :func:`query_key`."""
     return key.split("/")[-2]
 
 
 def encoding_of(message: Message) -> str:
-    """The Zenoh encoding of a message: protobuf, with its type as the schema."""
+    """Return the Zenoh encoding of a message: protobuf, with the message's type as schema."""
     return f"{_PROTOBUF};{message.DESCRIPTOR.full_name}"

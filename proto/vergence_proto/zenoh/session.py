@@ -1,8 +1,8 @@
-"""A Zenoh session in asyncio, as both ends of a stream use it. Needs the ``zenoh`` extra.
+"""A Zenoh session for asyncio, used by client and server. It needs the ``zenoh`` extra.
 
-Zenoh calls back in threads of its own, from which it must not be called again, and blocks where a
-message must wait. So what comes only crosses into the event loop, and what goes out is handed over
-in worker threads.
+Zenoh runs callbacks in its own threads, in which Zenoh must not be called, and it blocks while a
+message has to wait. Incoming messages are therefore passed on to the event loop, and outgoing ones
+are sent from worker threads.
 """
 
 import asyncio
@@ -25,34 +25,37 @@ from vergence_proto.zenoh.keys import encoding_of, server_of
 
 Value = TypeVar("Value")
 
-# A lossless message that waits for a slow receiver holds a thread; these are not the event loop's
-# own, which decode images and must not run out.
+# A lossless message that waits for a slow receiver holds a thread. The session has threads of its
+# own, because the event loop's default ones decode images and must stay free.
 _THREADS = 32
 
 _DEFAULTS: dict[str, Any] = {
-    # Nobody is found by chance: endpoints are named.
+    # Connect only to configured endpoints.
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
-    "scouting/delay": 0,  # for those that are found
-    # A node that vanished without a word is noticed after this, not after ten seconds.
+    "scouting/delay": 0,  # no time is spent on finding others
+    # In milliseconds: detect a silent peer after this time. The default is ten seconds.
     "transport/link/tx/lease": 5000,
-    # A raw pair takes longer than the default of 50 ms to leave over Wi-Fi, and every one would be
-    # dropped; credit bounds how many wait. In microseconds.
+    # In microseconds. Over Wi-Fi, sending a raw pair takes longer than the default of 50 ms, and
+    # every pair would be dropped. Credit limits how many wait.
     "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": 500_000,
-    # Zenoh waits seconds between attempts, and a stream has only the server's grace to come back.
+    # The default waits seconds between attempts, and a stream must resume within the server's
+    # grace period.
     "connect/retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 2},
 }
 
 
-class Undeclarable(Protocol):
+class Declaration(Protocol):
+    """A subscriber, queryable or liveliness token of a Zenoh session."""
+
     def undeclare(self) -> None: ...
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
-    """One server's answer to a query: the message's bytes, or the error it refused with."""
+class QueryReply:
+    """One server's reply to a query: the bytes of a message, or an error."""
 
-    server_id: str  # empty with an error: Zenoh does not tell whose it is
+    server_id: str  # the server that replied; empty for an error, since Zenoh does not report it
     payload: bytes
     error: DepthError | None
 
@@ -60,14 +63,15 @@ class Answer:
 def make_config(
     file: Path | None = None, /, *, max_message_bytes: int, **settings: Any
 ) -> zenoh.Config:
-    """A configuration from a Zenoh JSON5 file, else of our defaults; then ``settings`` by key.
+    """Read the configuration from a Zenoh JSON5 file, or start from the project's defaults.
 
-    Keys are Zenoh's with ``__`` for the slash. Raises zenoh.ZError: the file is not one.
+    ``settings`` override single values; their names are Zenoh's keys with ``__`` for the slash.
+    Raises zenoh.ZError: the file is no Zenoh configuration.
     """
     config = zenoh.Config.from_file(file) if file else zenoh.Config()
     values = {
         **({} if file else _DEFAULTS),
-        # The default would let one message take a gigabyte of memory.
+        # With the default, one message may use a gigabyte of memory.
         "transport/link/rx/max_message_size": max_message_bytes,
         **{key.replace("__", "/"): value for key, value in settings.items()},
     }
@@ -77,12 +81,15 @@ def make_config(
 
 
 def reason_of(error: zenoh.ZError) -> str:
-    """What Zenoh says, without the place in its own source."""
+    """Return Zenoh's message without the line of Zenoh's source code."""
     return str(error).partition(" at /")[0]
 
 
-class ZenohPeer:
-    """A session from :meth:`open` to :meth:`close`. Methods raise zenoh.ZError."""
+class ZenohSession:
+    """A Zenoh session, usable from :meth:`open` to :meth:`close`.
+
+    Every method raises zenoh.ZError: Zenoh failed, or the session is closed.
+    """
 
     def __init__(self, config: zenoh.Config) -> None:
         self._config = config
@@ -90,16 +97,18 @@ class ZenohPeer:
         self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="zenoh")
 
     async def open(self) -> None:
+        """Open the session and learn its ``id``. Call this once, in the event loop to use."""
         self._loop = asyncio.get_running_loop()
         try:
             self._session = await self._in_thread(lambda: zenoh.open(self._config))
         except BaseException:
             self._threads.shutdown(wait=False)
             raise
-        self.id = str(self._session.zid())
+        self.id: str = str(self._session.zid())
 
     async def close(self) -> None:
-        # Without it the interpreter hangs on its way out.
+        """Close the session, and with it everything that it declared."""
+        # The interpreter does not exit while a session is open.
         await self._in_thread(self._session.close)
         self._closed = True
         self._threads.shutdown(wait=False)
@@ -107,7 +116,7 @@ class ZenohPeer:
     async def put(
         self, key: str, message: Message, *, attachment_id: str, may_drop: bool = False
     ) -> None:
-        """Send a message. On a way that is full it waits there, or is dropped if it may be."""
+        """Send a message. On a congested link it waits, or is dropped if ``may_drop`` is set."""
 
         def put() -> None:
             self._session.put(
@@ -118,17 +127,17 @@ class ZenohPeer:
                 congestion_control=(
                     zenoh.CongestionControl.DROP if may_drop else zenoh.CongestionControl.BLOCK
                 ),
-                # One priority for all, or messages would overtake one another.
+                # All messages have one priority, or they would overtake one another.
                 priority=zenoh.Priority.REAL_TIME,
                 express=True,
             )
 
         await self._in_thread(put)
 
-    async def ask(
-        self, key: str, question: Message, *, timeout_s: float, attachment_id: str = ""
-    ) -> list[Answer]:
-        """What all those answer whose queryable matches; those that do not in time are left out."""
+    async def query(
+        self, key: str, request: Message, *, timeout_s: float, attachment_id: str = ""
+    ) -> list[QueryReply]:
+        """Return the replies of all matching servers that reply within ``timeout_s``."""
         replies: list[zenoh.Reply] = []
         done = asyncio.Event()
         handler = Callback(replies.append, self._to_loop(done.set), indirect=False)
@@ -137,8 +146,8 @@ class ZenohPeer:
             self._session.get(
                 key,
                 handler,
-                payload=question.SerializeToString(),
-                encoding=encoding_of(question),
+                payload=request.SerializeToString(),
+                encoding=encoding_of(request),
                 attachment=attachment_id,
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,
@@ -150,20 +159,20 @@ class ZenohPeer:
 
         await self._in_thread(get)
         await done.wait()
-        return [_answer(reply) for reply in replies]
+        return [_received(reply) for reply in replies]
 
-    async def subscribe(self, key: str, received: Callable[[zenoh.Sample], None]) -> Undeclarable:
-        """``received`` is called in Zenoh's thread: it must not call Zenoh, nor wait."""
+    async def subscribe(self, key: str, received: Callable[[zenoh.Sample], None]) -> Declaration:
+        """Call ``received`` in Zenoh's thread for each sample; it must not wait or call Zenoh."""
         handler = Callback(received, indirect=False)
         return await self._in_thread(lambda: self._session.declare_subscriber(key, handler))
 
-    async def answer_queries(self, key: str, asked: Callable[[zenoh.Query], None]) -> Undeclarable:
-        """``asked`` is called in the event loop, and must drop the query at last."""
+    async def answer_queries(self, key: str, asked: Callable[[zenoh.Query], None]) -> Declaration:
+        """Call ``asked`` in the event loop for each query; it must drop the query in the end."""
         handler = Callback(self._to_loop(asked), indirect=False)
         return await self._in_thread(lambda: self._session.declare_queryable(key, handler))
 
     async def reply(self, query: zenoh.Query, key: str, message: Message) -> None:
-        """Answer a query, on a concrete key of ours that matches it, and drop it."""
+        """Reply to a query on ``key``, a key without wildcards that matches it, and drop it."""
 
         def reply() -> None:
             with query:
@@ -172,7 +181,7 @@ class ZenohPeer:
         await self._in_thread(reply)
 
     async def refuse(self, query: zenoh.Query, status: status_pb2.Status) -> None:
-        """Answer a query with an error, and drop it."""
+        """Reply to a query with an error, and drop it."""
 
         def refuse() -> None:
             with query:
@@ -180,29 +189,30 @@ class ZenohPeer:
 
         await self._in_thread(refuse)
 
-    async def declare_alive(self, key: str) -> Undeclarable:
-        """A liveliness token, which goes when this session or the way to it does."""
+    async def declare_liveliness(self, key: str) -> Declaration:
+        """Declare a liveliness token, which vanishes when this session or the link to it ends."""
         return await self._in_thread(lambda: self._session.liveliness().declare_token(key))
 
-    async def watch_deaths(self, key: str, died: Callable[[str], None]) -> Undeclarable:
-        """``died`` is called in the event loop with the key of every token that goes."""
+    async def watch_liveliness(self, key: str, vanished: Callable[[str], None]) -> Declaration:
+        """Call ``vanished`` in the event loop with the key of every token that vanishes."""
 
         def changed(sample: zenoh.Sample) -> None:
             if sample.kind == zenoh.SampleKind.DELETE:
-                died(str(sample.key_expr))
+                vanished(str(sample.key_expr))
 
         handler = Callback(self._to_loop(changed), indirect=False)
         return await self._in_thread(
             lambda: self._session.liveliness().declare_subscriber(key, handler, history=True)
         )
 
-    async def undeclare(self, *declared: Undeclarable) -> None:
+    async def undeclare(self, *declared: Declaration) -> None:
+        """Undeclare them; a session that is closed has done so already."""
         if self._closed:
-            return  # and they are gone with it
+            return
 
         def undeclare() -> None:
             for each in declared:
-                with suppress(zenoh.ZError):  # the session closes meanwhile
+                with suppress(zenoh.ZError):  # the session closes at the same time
                     each.undeclare()
 
         await self._in_thread(undeclare)
@@ -213,18 +223,18 @@ class ZenohPeer:
         return await asyncio.get_running_loop().run_in_executor(self._threads, call)
 
     def _to_loop(self, function: Callable[..., None]) -> Callable[..., None]:
-        def callback(*items: Any) -> None:  # whatever Zenoh hands to this kind of callback
+        def callback(*items: Any) -> None:  # the arguments depend on the kind of callback
             with suppress(RuntimeError):  # the loop has closed before the session
                 self._loop.call_soon_threadsafe(function, *items)
 
         return callback
 
 
-def _answer(reply: zenoh.Reply) -> Answer:
+def _received(reply: zenoh.Reply) -> QueryReply:
     if (sample := reply.ok) is not None:
-        return Answer(server_of(str(sample.key_expr)), sample.payload.to_bytes(), None)
+        return QueryReply(server_of(str(sample.key_expr)), sample.payload.to_bytes(), None)
     assert reply.err is not None
-    return Answer("", b"", _error(reply.err))
+    return QueryReply("", b"", _error(reply.err))
 
 
 def _error(error: zenoh.ReplyError) -> DepthError:
@@ -232,4 +242,6 @@ def _error(error: zenoh.ReplyError) -> DepthError:
     with suppress(DecodeError):
         if refusal := codec.error_from_status(status_pb2.Status.FromString(payload)):
             return refusal
-    return ModelFailed(f"the server answered with an error that is not ours: {payload[:200]!r}")
+    return ModelFailed(
+        f"expected a google.rpc.Status of Vergence as the error, got {payload[:200]!r}"
+    )

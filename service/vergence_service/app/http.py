@@ -1,4 +1,4 @@
-"""The composition of the HTTP face: jobs on disk, routes, and the server that offers them."""
+"""Compose the HTTP transport: the jobs on disk, the routes and their server."""
 
 import asyncio
 import logging
@@ -30,20 +30,26 @@ _MIB = 1 << 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HttpFace:
+class HttpTransport:
+    """The HTTP server while it runs."""
+
     server: HttpServer
-    start_jobs: Callable[[], None]  # once the model is there
+    start_jobs: Callable[[], None]  # call it when the model is loaded
 
 
 @asynccontextmanager
 async def serving_http(
     settings: Settings,
+    host: str,
     engine: DepthEngine,
     unary: UnaryMethods,
     calls: OpenCalls,
     registry: CollectorRegistry,
-) -> AsyncIterator[HttpFace]:
-    """Listen and answer, to the end of the block. Raises PortTaken."""
+) -> AsyncIterator[HttpTransport]:
+    """Serve HTTP until the end of the block.
+
+    Raises PortTaken if the server cannot listen on ``host``.
+    """
     batch = settings.batch
     archive = ArchiveLimits(
         max_files=batch.max_files,
@@ -54,7 +60,7 @@ async def serving_http(
         max_bytes=batch.max_upload_mib * _MIB, idle_s=batch.idle_s, archive=archive
     )
     pair = UploadLimits(
-        max_bytes=2 * settings.grpc.max_frame_mib * _MIB,
+        max_bytes=2 * settings.limits.max_frame_mib * _MIB,
         idle_s=batch.idle_s,
         archive=replace(archive, max_files=2),
     )
@@ -65,8 +71,8 @@ async def serving_http(
         try:
             store = stack.enter_context(JobStore(batch.directory or _default_jobs_directory()))
         except StoreUnavailable as error:
-            # Live depth is worth serving without a disk.
-            log.warning("sequences are not taken: %s", error)
+            # Without a disk the server can still serve live streams.
+            log.warning("this server accepts no sequences: %s", error)
             routes.append(no_sequence_routes(str(error)))
             start = _nothing
         else:
@@ -94,15 +100,13 @@ async def serving_http(
             routes=routes,
         )
         server = await stack.enter_async_context(
-            HttpServer(
-                app, calls, host=settings.http.host, port=settings.http.port, stopping=stopping
-            )
+            HttpServer(app, calls, host=host, port=settings.http.port, stopping=stopping)
         )
-        yield HttpFace(server, start)
+        yield HttpTransport(server, start)
 
 
 def _nothing() -> None:
-    """No jobs are to be started."""
+    """Start no jobs, because there is no queue."""
 
 
 def _default_jobs_directory() -> Path:

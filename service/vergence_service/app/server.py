@@ -1,4 +1,4 @@
-"""The composition root: settings in, a running server out."""
+"""Compose the server from its settings, run it, and drain it at the end."""
 
 import asyncio
 import signal
@@ -11,7 +11,7 @@ from prometheus_client import CollectorRegistry
 
 from vergence_proto.types import Delivery
 from vergence_service.app.http import serving_http
-from vergence_service.app.zenoh import ZenohFace, on_zenoh
+from vergence_service.app.zenoh import ZenohTransport, serving_zenoh
 from vergence_service.inference.batcher import StepBatcher
 from vergence_service.inference.model import StereoModel
 from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
@@ -20,7 +20,7 @@ from vergence_service.settings import Settings
 from vergence_service.streams.continuity import ContinuityLimits
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.table import StreamTable
-from vergence_service.transports.addresses import place
+from vergence_service.transports.addresses import format_address
 from vergence_service.transports.grpc.server import DepthServicer, GrpcServer
 from vergence_service.transports.http.app import HttpServer
 from vergence_service.transports.open_calls import OpenCalls
@@ -33,18 +33,22 @@ _SWEEP_EVERY_S = 1.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Running:
-    """A server that serves."""
+    """A server while it serves."""
 
     grpc_address: str
     http_address: str
     engine: DepthEngine
     grpc: GrpcServer
     http: HttpServer
-    zenoh: ZenohFace | None
+    zenoh: ZenohTransport | None
 
 
 def make_model(settings: Settings) -> OnnxStereoModel:
-    """Raises ManifestError, ProviderUnavailable, FileNotFoundError: no such weights here."""
+    """Load the model card of the settings.
+
+    Raises ManifestError if the manifest cannot be used, ProviderUnavailable if an execution
+    provider is missing, and FileNotFoundError if there are no weights.
+    """
     return OnnxStereoModel(
         settings.model.weights or packaged_weights_dir(),
         settings.model.name,
@@ -58,16 +62,18 @@ def make_model(settings: Settings) -> OnnxStereoModel:
 async def running(
     settings: Settings, model: StereoModel, *, clock: Callable[[], float] = time.monotonic
 ) -> AsyncIterator[Running]:
-    """A server from its first listening socket to its last; inside the block it serves.
+    """Run a server; it serves until the end of the block.
 
-    Raises PortTaken, ExtraMissing, ZenohUnreachable, and what the model raises when it loads.
+    Raises PortTaken if a port is in use, ExtraMissing if Zenoh is not installed, ZenohUnreachable
+    if its network cannot be joined, and ManifestError or ProviderUnavailable if the model cannot
+    be loaded.
     """
     registry = CollectorRegistry()
     metrics = Metrics(registry)
     streams = StreamTable(
         capacity=settings.streams.capacity,
-        per_client=settings.streams.per_client,
-        max_state_bytes=settings.streams.max_state_mib * _MIB,
+        per_client=settings.limits.streams_per_client,
+        max_state_bytes=settings.limits.max_state_mib * _MIB,
         idle_timeout_s=settings.streams.idle_timeout_s,
         idle_notice_s=settings.streams.idle_notice_s,
         detach_grace_s=settings.streams.detach_grace_s,
@@ -85,14 +91,14 @@ async def running(
             Delivery.EVERY: settings.model.cold_iterations_every,
         },
         limits=ContinuityLimits(**settings.continuity.model_dump()),
-        max_pixels=settings.streams.max_pixels,
+        max_pixels=settings.limits.max_pixels,
         clock=clock,
         metrics=metrics,
     )
-    max_frame_bytes = settings.grpc.max_frame_mib * _MIB
+    max_frame_bytes = settings.limits.max_frame_mib * _MIB
     limits = StreamLimits(
-        credit=settings.grpc.credit,
-        waiting_frames=settings.grpc.waiting_frames,
+        credit=settings.streams.credit,
+        waiting_frames=settings.streams.waiting_frames,
         max_frame_bytes=max_frame_bytes,
     )
     unary = UnaryMethods(
@@ -105,17 +111,19 @@ async def running(
     def open_calls() -> OpenCalls:
         return OpenCalls(engine, limits=limits, clock=clock)
 
-    # Outermost ends last: no transport outlives the batcher that it feeds.
+    grpc_host = settings.grpc.host or settings.server.host
+    http_host = settings.http.host or settings.server.host
+    # The outermost context ends last: no transport outlives the batcher that it uses.
     async with (
         batcher,
         GrpcServer(
             DepthServicer(unary, open_calls()),
-            host=settings.grpc.host,
+            host=grpc_host,
             port=settings.grpc.port,
             max_frame_bytes=max_frame_bytes,
         ) as grpc_server,
-        serving_http(settings, engine, unary, open_calls(), registry) as http,
-        on_zenoh(settings, unary, open_calls()) as zenoh,
+        serving_http(settings, http_host, engine, unary, open_calls(), registry) as http,
+        serving_zenoh(settings, unary, open_calls()) as zenoh,
         _sweeping(streams),
     ):
         await engine.start()
@@ -124,8 +132,8 @@ async def running(
         if zenoh is not None:
             await zenoh.server.serving()
         yield Running(
-            place(settings.grpc.host, grpc_server.port),
-            place(settings.http.host, http.server.port),
+            format_address(grpc_host, grpc_server.port),
+            format_address(http_host, http.server.port),
             engine,
             grpc_server,
             http.server,
@@ -134,7 +142,11 @@ async def running(
 
 
 async def serve(settings: Settings, *, on_serving: Callable[[Running], None]) -> None:
-    """Serve until SIGTERM or SIGINT, then drain. Raises as make_model and running."""
+    """Serve until SIGTERM or SIGINT, then drain.
+
+    Raises FileNotFoundError, ManifestError or ProviderUnavailable if the model cannot be loaded;
+    PortTaken, ExtraMissing or ZenohUnreachable if a transport cannot start.
+    """
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -143,11 +155,11 @@ async def serve(settings: Settings, *, on_serving: Callable[[Running], None]) ->
         async with running(settings, model) as server:
             on_serving(server)
             await stop.wait()
-            await drain(server, within_s=settings.grpc.drain_s)
+            await drain(server, within_s=settings.server.drain_s)
 
 
 async def drain(server: Running, *, within_s: float) -> None:
-    """Tell clients, let them leave, answer what they have sent; within twice the time given."""
+    """Notify clients, let them leave, and answer what they have sent, in twice ``within_s``."""
     server.engine.drain(within_s=within_s)
     async with asyncio.TaskGroup() as tasks:
         tasks.create_task(server.grpc.drain(within_s=within_s))

@@ -1,4 +1,4 @@
-"""The composition of the Zenoh face, if it is wanted: where it is found, and what answers there."""
+"""Compose the Zenoh transport, if the settings enable it."""
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -6,28 +6,34 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from vergence_service.settings import Settings
-from vergence_service.transports.addresses import place
+from vergence_service.transports.addresses import format_address
 from vergence_service.transports.errors import ExtraMissing
 from vergence_service.transports.open_calls import OpenCalls
 from vergence_service.transports.unary import UnaryMethods
 
-if TYPE_CHECKING:  # Zenoh is an extra
+if TYPE_CHECKING:  # Zenoh is an optional extra
     from vergence_service.transports.zenoh.server import ZenohServer
 
-_ROUTER_PORT = 7447  # by custom
+_ROUTER_PORT = 7447  # Zenoh's default port
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ZenohFace:
+class ZenohTransport:
+    """The Zenoh server while it runs."""
+
     server: "ZenohServer"
-    endpoint: str  # where clients find it, or the file that says so
+    endpoint: str  # the endpoint for clients, or the file that configures it
 
 
 @asynccontextmanager
-async def on_zenoh(
+async def serving_zenoh(
     settings: Settings, unary: UnaryMethods, calls: OpenCalls
-) -> AsyncIterator[ZenohFace | None]:
-    """On the network to the end of the block. Raises ExtraMissing, ZenohUnreachable."""
+) -> AsyncIterator[ZenohTransport | None]:
+    """Serve over Zenoh until the end of the block, or yield None if it is not enabled.
+
+    Raises ExtraMissing if Zenoh is not installed, and ZenohUnreachable if the network cannot be
+    joined.
+    """
     chosen = settings.zenoh
     if not chosen.enabled:
         yield None
@@ -38,7 +44,8 @@ async def on_zenoh(
         raise ExtraMissing("Zenoh", "zenoh") from None
     listen = list(chosen.listen)
     if chosen.mode == "router" and not listen:
-        listen = [f"tcp/{place(settings.grpc.host, _ROUTER_PORT)}"]
+        host = chosen.host or settings.server.host
+        listen = [f"tcp/{format_address(host, _ROUTER_PORT)}"]
     config = zenoh_config(
         chosen.config,
         mode=chosen.mode,
@@ -48,4 +55,4 @@ async def on_zenoh(
     )
     endpoint = str(chosen.config or ",".join(listen or chosen.connect))
     async with ZenohServer(unary, calls, config=config, namespace=chosen.namespace) as server:
-        yield ZenohFace(server, endpoint)
+        yield ZenohTransport(server, endpoint)

@@ -1,59 +1,63 @@
-"""When the next live frame is due: the gaps that other work may fill without being in the way."""
+"""Predict the next frame of live streams, so that other work can run in the gaps."""
 
 from dataclasses import dataclass
 
-# A step cannot be interrupted, so one that would still run when a live frame comes is held back.
-# Of the interval between a stream's frames, how much later than expected the next may be.
+# A step cannot be interrupted. A step that would still run when a live frame arrives has to wait.
+# The next frame may arrive late by this share of the interval between a stream's frames.
 _LATE = 0.5
-# Streams with longer intervals than this have no rhythm that is worth waiting for.
+# Streams with longer intervals than this are not predicted: waiting for them would cost too much.
 _LONGEST_S = 1.0
 _SMOOTHING = 0.2
 
 
 @dataclass(slots=True)
-class _Beat:
-    last_s: float  # when its last frame came
-    answered_s: float  # when that was answered; until then no other can come
-    interval_s: float | None = None  # None: only one frame has come
+class _Cadence:
+    """The times of one stream's frames."""
+
+    last_s: float  # arrival of the last frame
+    answered_s: float  # time of the last answer; the client sends no frame before it
+    interval_s: float | None = None  # smoothed interval; None after the first frame
 
 
 @dataclass(frozen=True, slots=True)
-class Due:
-    """A live frame that is expected."""
+class ExpectedFrame:
+    """A live frame that will probably arrive."""
 
-    at_s: float
-    until_s: float  # after which it is not waited for
+    at_s: float  # expected arrival
+    until_s: float  # stop waiting for the frame at this time
 
 
-class LiveRhythm:
-    """Learns from the arrivals of live steps when the next ones come, stream by stream."""
+class ArrivalPredictor:
+    """Learns the interval between frames of each live stream and predicts the next arrival."""
 
     def __init__(self) -> None:
-        self._beats: dict[str, _Beat] = {}
+        self._cadences: dict[str, _Cadence] = {}
 
     def arrived(self, stream_id: str, now_s: float) -> None:
-        beat = self._beats.get(stream_id)
-        interval_s = 0.0 if beat is None else now_s - beat.last_s
-        if beat is None or interval_s > _LONGEST_S:
-            self._beats[stream_id] = _Beat(now_s, now_s)
+        """Record that a frame of the stream arrived."""
+        cadence = self._cadences.get(stream_id)
+        interval_s = 0.0 if cadence is None else now_s - cadence.last_s
+        if cadence is None or interval_s > _LONGEST_S:
+            self._cadences[stream_id] = _Cadence(now_s, now_s)
             return
-        known_s = beat.interval_s or interval_s
-        beat.interval_s = known_s + _SMOOTHING * (interval_s - known_s)
-        beat.last_s = now_s
+        known_s = cadence.interval_s or interval_s
+        cadence.interval_s = known_s + _SMOOTHING * (interval_s - known_s)
+        cadence.last_s = now_s
 
     def answered(self, stream_id: str, now_s: float) -> None:
-        if stream_id in self._beats:
-            self._beats[stream_id].answered_s = now_s
+        """Record that the last frame of the stream was answered."""
+        if stream_id in self._cadences:
+            self._cadences[stream_id].answered_s = now_s
 
-    def next_due(self, now_s: float) -> Due | None:
-        """The live frame that is expected first; None if none is, or none has a rhythm."""
-        found: Due | None = None
-        for stream_id, beat in list(self._beats.items()):
-            if now_s - beat.last_s > _LONGEST_S * (1 + _LATE):
-                del self._beats[stream_id]
-            elif beat.interval_s:
-                at_s = beat.last_s + beat.interval_s
-                until_s = max(at_s, beat.answered_s) + _LATE * beat.interval_s
+    def next_expected(self, now_s: float) -> ExpectedFrame | None:
+        """Return the live frame that is expected first, or None if none is expected."""
+        found: ExpectedFrame | None = None
+        for stream_id, cadence in list(self._cadences.items()):
+            if now_s - cadence.last_s > _LONGEST_S * (1 + _LATE):
+                del self._cadences[stream_id]
+            elif cadence.interval_s:
+                at_s = cadence.last_s + cadence.interval_s
+                until_s = max(at_s, cadence.answered_s) + _LATE * cadence.interval_s
                 if now_s < until_s and (found is None or at_s < found.at_s):
-                    found = Due(at_s, until_s)
+                    found = ExpectedFrame(at_s, until_s)
         return found

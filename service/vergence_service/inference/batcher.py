@@ -1,8 +1,8 @@
-"""The steps that wait for the model, taken across streams: together, or each in a lane of its own.
+"""Schedule the steps of all streams on the model: in batches, or one per lane.
 
-A model on a GPU takes batches. One on a CPU may have lanes instead: threads that step it one frame
-each, whenever one of them is free. In a batch two busy streams would hardly ever meet, as each
-frame arrives while the other stream's is in the model.
+A model on a GPU takes batches. A model on a CPU may have lanes instead: threads that each take one
+frame whenever they are free. Batches would not help there: a frame usually arrives while another
+stream's frame is already in the model, so two busy streams would hardly ever share a batch.
 """
 
 import asyncio
@@ -10,39 +10,36 @@ import logging
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 from vergence_proto.errors import DepthError, Draining, FrameStale, ModelFailed
-from vergence_service.inference.arrivals import LiveRhythm
+from vergence_proto.types import Timings
+from vergence_service.inference.arrivals import ArrivalPredictor
 from vergence_service.inference.model import Step, StepResult, StereoModel
 from vergence_service.metrics import Metrics
 
 log = logging.getLogger(__name__)
 
-# A step that gives way to live ones does so for no longer: a batch goes on, if slowly, beside
-# streams that leave no gap, and one live frame in thirty is late for it.
+# A step that is not live waits for live steps at most this long. A job then continues, if slowly,
+# beside streams that leave no gap, and one live frame in thirty is late because of it.
 _PATIENCE_S = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TimedResult:
-    result: StepResult
-    queue_s: float  # from the request to the start of the batch
-    model_s: float  # of the whole batch
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Waiting:
+    """A step that waits for the model."""
+
     step: Step
     since_s: float
     deadline_s: float | None
     live_stream: str | None
-    answer: asyncio.Future[TimedResult]
+    timings: Timings
+    answer: asyncio.Future[tuple[StepResult, Timings]]
 
     @property
     def shape_of_work(self) -> tuple[object, ...]:
-        """Rows can share a batch if this is equal."""
+        """Return a key; steps with equal keys can share a batch."""
         return self.live, self.step.view.left.shape, self.step.iterations, self.step.cold
 
     @property
@@ -51,13 +48,13 @@ class _Waiting:
 
 
 class StepBatcher:
-    """Gathers the steps that wait for the model and runs them as it takes them, oldest first.
+    """Collects the steps that wait for the model and runs them, oldest first.
 
-    Live steps come before all others, which fill the gaps that they leave, in batches of their
-    own: one that would be in the way of a live frame, in the model or expected, is held back, but
-    not for ever.
-    Every waiter gets a result or an exception: ModelFailed, NonFinite, FrameStale, or Draining
-    when the batcher ends first. A caller never has two steps of one stream waiting.
+    Live steps run first. Other steps run in the gaps, in separate batches. A non-live step that
+    would delay a live frame (running or expected soon) waits, at most ``_PATIENCE_S``.
+
+    Every waiter gets a result or an exception: ModelFailed, NonFinite, FrameStale, or Draining if
+    the batcher ends first. A caller must never have two steps of one stream waiting.
     """
 
     def __init__(
@@ -68,20 +65,23 @@ class StepBatcher:
         clock: Callable[[], float],
         metrics: Metrics,
     ) -> None:
+        lanes = model.max_concurrent_steps
         self._model = model
-        # The first row of a batch would wait for the last while another lane stands empty.
-        self._max_batch = max_batch if model.lanes == 1 else 1
+        # In a batch the first row would wait for the last while another lane is free.
+        self._max_batch = max_batch if lanes == 1 else 1
         self._clock = clock
         self._metrics = metrics
         self._waiting: list[_Waiting] = []
         self._in_model: list[_Waiting] = []
-        self._free_lanes = asyncio.Semaphore(model.lanes)
-        self._changed = asyncio.Event()  # a step arrived, or left the model
-        self._rhythm = LiveRhythm()
-        self._work_s: dict[tuple[object, ...], float] = {}  # how long each shape of work took
+        self._free_lanes = asyncio.Semaphore(lanes)
+        self._changed = asyncio.Event()  # set when a step arrives or leaves the model
+        self._arrivals = ArrivalPredictor()
+        self._work_s: dict[tuple[object, ...], float] = {}  # last duration per shape of work
 
     async def __aenter__(self) -> Self:
-        self._threads = ThreadPoolExecutor(self._model.lanes, thread_name_prefix="model")
+        self._threads = ThreadPoolExecutor(
+            self._model.max_concurrent_steps, thread_name_prefix="model"
+        )
         self._worker = asyncio.create_task(self._run(), name="step-batcher")
         return self
 
@@ -89,7 +89,7 @@ class StepBatcher:
         self._worker.cancel()
         await asyncio.gather(self._worker, return_exceptions=True)
         await asyncio.to_thread(self._threads.shutdown)
-        for item in _wanted([*self._in_model, *self._waiting]):
+        for item in _unanswered([*self._in_model, *self._waiting]):
             item.answer.set_exception(Draining("the server stopped before it took the frame"))
 
     async def warm_up(self, iterations: int, *cold_iterations: int) -> None:
@@ -98,17 +98,28 @@ class StepBatcher:
         await loop.run_in_executor(self._threads, self._model.warm_up, iterations, *cold_iterations)
 
     async def step(
-        self, step: Step, *, deadline_s: float | None = None, live_stream: str | None = None
-    ) -> TimedResult:
-        """The result of one step; FrameStale if the model was not free before ``deadline_s``.
+        self,
+        step: Step,
+        *,
+        timings: Timings | None = None,
+        deadline_s: float | None = None,
+        live_stream: str | None = None,
+    ) -> tuple[StepResult, Timings]:
+        """Run one step; return its result, and ``timings`` extended by the wait and the model.
 
-        ``live_stream`` is the stream that it is of, None for a step that gives way to live ones.
+        ``live_stream`` is the id of the step's live stream, or None if the step is not live.
+
+        Raises FrameStale if the model was not free before ``deadline_s``, ModelFailed or NonFinite
+        if the model failed, and Draining if the batcher ends first.
         """
         now_s = self._clock()
-        answer: asyncio.Future[TimedResult] = asyncio.get_running_loop().create_future()
-        self._waiting.append(_Waiting(step, now_s, deadline_s, live_stream, answer))
+        answer: asyncio.Future[tuple[StepResult, Timings]]
+        answer = asyncio.get_running_loop().create_future()
+        self._waiting.append(
+            _Waiting(step, now_s, deadline_s, live_stream, timings or Timings(), answer)
+        )
         if live_stream is not None:
-            self._rhythm.arrived(live_stream, now_s)
+            self._arrivals.arrived(live_stream, now_s)
         self._changed.set()
         return await answer
 
@@ -122,13 +133,13 @@ class StepBatcher:
 
     async def _in_lane(self, batch: list[_Waiting]) -> None:
         await self._step_together(batch)
-        # Not where it is cancelled: those without an answer get one from __aexit__.
+        # Not reached when cancelled: __aexit__ then answers the steps that have no answer.
         self._in_model = [item for item in self._in_model if item not in batch]
         self._free_lanes.release()
         self._changed.set()
 
     async def _next_batch(self) -> list[_Waiting]:
-        """What the model is to do next, as soon as it is time for it."""
+        """Return the next work of the model, as soon as it may start."""
         while True:
             batch = self._oldest()
             hold_s = self._hold_s(batch[0]) if batch else None
@@ -140,34 +151,34 @@ class StepBatcher:
                 await asyncio.wait_for(self._changed.wait(), hold_s)
 
     def _hold_s(self, first: _Waiting) -> float:
-        """How long the work of ``first`` is to stay out of the way of a live frame."""
+        """Return the time that ``first`` must wait so that it delays no live frame."""
         now_s = self._clock()
         patience_s = _PATIENCE_S - (now_s - first.since_s)
         if first.live or patience_s <= 0:
             return 0.0
         if any(item.live for item in self._in_model):
             return patience_s
-        if (due := self._rhythm.next_due(now_s)) is None:
+        if (expected := self._arrivals.next_expected(now_s)) is None:
             return 0.0
-        # What was never seen is taken to be as long as the longest that was.
+        # Assume that work of an unknown shape takes as long as the longest work so far.
         longest_s = max(self._work_s.values(), default=0.0)
         ends_s = now_s + self._work_s.get(first.shape_of_work, longest_s)
-        return due.until_s - now_s if ends_s > due.at_s else 0.0
+        return expected.until_s - now_s if ends_s > expected.at_s else 0.0
 
     def _oldest(self) -> list[_Waiting]:
-        """Of what waits: live or not, then oldest first, as much as the model takes together."""
+        """Return the steps to run next: live before others, then oldest first, up to one batch."""
         now_s = self._clock()
-        wanted = _wanted(self._waiting)
-        for item in wanted:
+        unanswered = _unanswered(self._waiting)
+        for item in unanswered:
             if item.deadline_s is not None and now_s > item.deadline_s:
                 item.answer.set_exception(
                     FrameStale(
-                        f"the frame waited {now_s - item.since_s:.3f} s for the model, past its "
-                        "maximum age; the stream is as it was"
+                        f"the frame waited {now_s - item.since_s:.3f} s for the model, longer than "
+                        "its maximum age; the stream is unchanged"
                     )
                 )
         # The sort is stable: oldest first.
-        self._waiting = sorted(_wanted(wanted), key=lambda item: not item.live)
+        self._waiting = sorted(_unanswered(unanswered), key=lambda item: not item.live)
         work = self._waiting[0].shape_of_work if self._waiting else None
         return [item for item in self._waiting if item.shape_of_work == work][: self._max_batch]
 
@@ -181,8 +192,8 @@ class StepBatcher:
             if len(batch) == 1:
                 _fail(batch[0], error)
                 return
-            # One bad row must not fail its neighbours: find it by stepping each alone.
-            for item in _wanted(batch):
+            # One bad row must not fail its neighbours: find it by stepping each row alone.
+            for item in _unanswered(batch):
                 await self._step_together([item])
             return
         model_s = self._clock() - started_s
@@ -190,14 +201,15 @@ class StepBatcher:
         self._metrics.batch_size.observe(len(batch))
         for item, result in zip(batch, results, strict=True):
             if item.live_stream is not None:
-                self._rhythm.answered(item.live_stream, started_s + model_s)
+                self._arrivals.answered(item.live_stream, started_s + model_s)
             if not item.answer.done():
-                queue_s = started_s - item.since_s
-                item.answer.set_result(TimedResult(result, queue_s, model_s))
+                queue_s = item.timings.queue_s + started_s - item.since_s
+                timings = replace(item.timings, queue_s=queue_s, model_s=model_s)
+                item.answer.set_result((result, timings))
 
 
-def _wanted(items: Sequence[_Waiting]) -> list[_Waiting]:
-    """A caller that gave up leaves a finished future behind; setting it again would raise."""
+def _unanswered(items: Sequence[_Waiting]) -> list[_Waiting]:
+    """Return the items that still need an answer; a caller that gave up has cancelled its own."""
     return [item for item in items if not item.answer.done()]
 
 
@@ -206,5 +218,5 @@ def _fail(item: _Waiting, error: Exception) -> None:
         return
     if not isinstance(error, DepthError):
         log.error("the model raised", exc_info=error)
-        error = ModelFailed("the model failed on this frame; the stream is as it was before it")
+        error = ModelFailed("the model failed on this frame; the stream is unchanged")
     item.answer.set_exception(error)

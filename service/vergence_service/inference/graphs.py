@@ -1,9 +1,9 @@
-"""The graphs of a model, run as :mod:`vergence_proto.model_io` says: stage after stage.
+"""Run the graphs of a model stage after stage, as :mod:`vergence_proto.model_io` defines.
 
-The graphs of a stage run side by side, on threads of their own. Where a network has large parts
-that do not need each other, that is as quick as to divide every operator between the same threads,
-for less work: the threads meet once a stage and each keeps to its own cache. While several steps
-are taken at once it is they that run side by side, each graph after graph.
+The graphs of one stage run in parallel, each on its own thread. Running independent subgraphs in
+parallel is as fast as sharing every operator among the threads, and uses less CPU: the threads
+synchronise once per stage, and each keeps to its own cache. When several steps run at once, the
+steps run in parallel instead, and each runs its graphs one after the other.
 """
 
 import logging
@@ -20,25 +20,25 @@ from numpy.typing import NDArray
 from onnxruntime import InferenceSession, SessionOptions
 
 from vergence_proto.model_io import DISPARITY, SIGMA, ManifestError, ModelCard, Stages
-from vergence_service.inference.providers import Resident, Tensor, run_on_device, start_session
+from vergence_service.inference.providers import DeviceTensor, Tensor, run_on_device, start_session
 
 log = logging.getLogger(__name__)
 
-Tensors = Mapping[str, NDArray[np.generic] | Resident]
+Tensors = Mapping[str, NDArray[np.generic] | DeviceTensor]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Part:
-    """A graph as the steps of one iteration count use it."""
+class _Graph:
+    """One graph, with the outputs that steps of one iteration count need."""
 
     session: InferenceSession
     inputs: tuple[str, ...]
-    to_host: tuple[str, ...]
-    to_stay: tuple[str, ...]
+    to_host: tuple[str, ...]  # outputs that are copied to the host
+    to_stay: tuple[str, ...]  # outputs that stay on the device
 
     @classmethod
-    def of(cls, session: InferenceSession, needed: set[str]) -> "_Part":
-        """The part that gives whatever is ``needed`` and the graph has."""
+    def of(cls, session: InferenceSession, needed: set[str]) -> "_Graph":
+        """Select the outputs of ``session`` that are ``needed``."""
         outputs = [name for name in _output_names(session) if name in needed]
         maps = tuple(name for name in outputs if name in (DISPARITY, SIGMA))
         rest = tuple(name for name in outputs if name not in maps)
@@ -55,13 +55,13 @@ class _Part:
         return dict(zip(names, [*host, *stayed], strict=True))
 
 
-class StagedGraphs:
-    """The graphs of a model, each loaded once.
+class GraphRunner:
+    """Loads each graph of a model once and runs steps.
 
-    ``providers`` are onnxruntime's names. Steps use ``threads`` threads, 0 for one a core. As many
-    of them as ``lanes`` may run at once: one that is alone runs the graphs of a stage side by side,
-    one that is not runs them one after the other, to the same result. With a ``device`` all but the
-    maps stays there, from stage to stage and in what a step returns.
+    ``providers`` are onnxruntime's names. All steps share ``threads`` threads; 0 uses one per core.
+    At most ``max_concurrent_steps`` steps may run at once. A step that runs alone runs the graphs
+    of a stage in parallel; otherwise each step runs them one after the other, with the same result.
+    With a ``device``, all outputs except the maps stay on it, between stages and after the step.
     """
 
     def __init__(
@@ -78,27 +78,28 @@ class StagedGraphs:
         self._allow_spinning = allow_spinning
         self._device = device
         self._sessions: dict[Path, InferenceSession] = {}
-        self._steps: dict[Stages, list[list[_Part]]] = {}
+        self._steps: dict[Stages, list[list[_Graph]]] = {}
         width = max(map(len, card.all_stages))
-        self.lanes = min(threads or _cores(), width)
-        # A model that is cut for several threads leaves each of them its own graph, also in stages
-        # of one: two threads that shared the last graph of `lite`, operator by operator, took 15 %
-        # less time but a fifth more work, while another stream's step can use the second thread
-        # whole. Alone: onnxruntime knows best what "one a core" is.
+        self.max_concurrent_steps = min(threads or _cores(), width)
+        # A model that is cut for several threads runs each graph on one thread, also in stages of
+        # one graph. Two threads that shared the last graph of `lite`, operator by operator, took
+        # 15 % less time but a fifth more work, and another stream's step can use the second thread
+        # better. A model of one graph passes 0 on: onnxruntime itself counts the cores best.
         self._operator_threads = max(1, (threads or _cores()) // width) if width > 1 else threads
-        self._beside = ThreadPoolExecutor(self.lanes, thread_name_prefix="graph")
+        self._side_pool = ThreadPoolExecutor(self.max_concurrent_steps, thread_name_prefix="graph")
         self._running = 0
         self._counting = threading.Lock()
         self._loading = threading.Lock()
 
     def close(self) -> None:
-        """End the threads; no step may follow."""
-        self._beside.shutdown()
+        """Stop the threads. No step may follow."""
+        self._side_pool.shutdown()
 
-    def load(self, iterations: int, *, cold_pixels: int | None = None) -> list[list[_Part]]:
-        """The graphs of a step, from now on in memory.
+    def load(self, iterations: int, *, cold_pixels: int | None = None) -> list[list[_Graph]]:
+        """Load the graphs of a step, if they are not loaded yet, and return them by stage.
 
-        Raises ManifestError, the graphs do not fit together, and ProviderUnavailable.
+        Raises ManifestError if the graphs do not fit together, and ProviderUnavailable if the
+        execution provider cannot start.
         """
         step = self._card.stages(iterations, cold_pixels=cold_pixels)
         with self._loading:
@@ -107,23 +108,23 @@ class StagedGraphs:
                 log.info("loaded %s, %d iterations", self._card.name, iterations)
             return self._steps[step]
 
-    def _loaded(self, iterations: int, step: Stages) -> list[list[_Part]]:
+    def _loaded(self, iterations: int, step: Stages) -> list[list[_Graph]]:
         stages = [[*map(self._session, stage)] for stage in step]
         _require_fit(self._card, iterations, stages)
         needed = set(self._card.output_names)
-        parts: list[list[_Part]] = []
+        graphs: list[list[_Graph]] = []
         for stage in reversed(stages):
-            parts.insert(0, [_Part.of(session, needed) for session in stage])
-            needed.update(name for part in parts[0] for name in part.inputs)
-        return parts
+            graphs.insert(0, [_Graph.of(session, needed) for session in stage])
+            needed.update(name for graph in graphs[0] for name in graph.inputs)
+        return graphs
 
     def run(self, iterations: int, given: Tensors, *, cold_pixels: int | None) -> dict[str, Tensor]:
-        """One step of a batch: the card's inputs to the card's outputs, by name."""
+        """Run one step of a batch, from the model card's inputs to its outputs, by name."""
         stages = self.load(iterations, cold_pixels=cold_pixels)
         found: dict[str, Tensor] = {}
         with self._counted():
-            for parts in stages:
-                for outputs in self._run_stage(parts, {**given, **found}):
+            for graphs in stages:
+                for outputs in self._run_stage(graphs, {**given, **found}):
                     found |= outputs
         return {name: found[name] for name in self._card.output_names}
 
@@ -137,37 +138,38 @@ class StagedGraphs:
             with self._counting:
                 self._running -= 1
 
-    def _run_stage(self, parts: Sequence[_Part], tensors: Tensors) -> list[dict[str, Tensor]]:
-        if self.lanes == 1 or self._running > 1:
-            return [part.run(tensors, self._device) for part in parts]
-        first, *others = parts  # the caller's thread takes a graph as well
+    def _run_stage(self, graphs: Sequence[_Graph], tensors: Tensors) -> list[dict[str, Tensor]]:
+        if self.max_concurrent_steps == 1 or self._running > 1:
+            return [graph.run(tensors, self._device) for graph in graphs]
+        first, *others = graphs  # the caller's thread runs a graph as well
         futures: list[Future[dict[str, Tensor]]] = []
         try:
-            futures += (self._beside.submit(part.run, tensors, self._device) for part in others)
+            futures += (
+                self._side_pool.submit(graph.run, tensors, self._device) for graph in others
+            )
             outputs = first.run(tensors, self._device)
         finally:
-            wait(futures)  # also where one fails: no graph runs on into the next step
+            wait(futures)  # also after a failure: no graph may still run during the next step
         return [outputs, *(future.result() for future in futures)]
 
-    def _session(self, graph: Path) -> InferenceSession:
-        if graph not in self._sessions:
+    def _session(self, path: Path) -> InferenceSession:
+        if path not in self._sessions:
             options = SessionOptions()
             options.intra_op_num_threads = self._operator_threads
-            # Planning the reuse of buffers took a second of a long graph's start and saved no
-            # memory: the arena gives freed buffers out again without a plan, and steps are as
-            # quick.
+            # Planning the reuse of buffers took one second when a long graph was loaded and saved
+            # no memory: the arena reuses freed buffers without a plan, and steps are as fast.
             options.enable_mem_reuse = False
             if not self._allow_spinning:
-                # As long as the next operator of a step may take to come, never between steps.
+                # Long enough to wait for the next operator of a step, but not for the next step.
                 options.add_session_config_entry("session.intra_op.spin_duration_us", "20")
-            self._sessions[graph] = start_session(graph, options, self._providers)
-        return self._sessions[graph]
+            self._sessions[path] = start_session(path, options, self._providers)
+        return self._sessions[path]
 
 
 def _require_fit(
     card: ModelCard, iterations: int, stages: Sequence[Sequence[InferenceSession]]
 ) -> None:
-    """Raises ManifestError: an input comes from nowhere, an output from nowhere or from two."""
+    """Raise ManifestError if an input has no source, or an output has none or more than one."""
     step = f"{card.name}, {iterations} iterations"
     known = set(card.input_names)
     for stage in stages:
@@ -175,14 +177,16 @@ def _require_fit(
             if missing := set(_input_names(session)) - known:
                 raise ManifestError(
                     f"{step}: expected {', '.join(sorted(missing))} from a graph of an earlier "
-                    "stage; the graphs are of different exports"
+                    "stage; the graphs come from different exports"
                 )
         for session in stage:
             if twice := known.intersection(_output_names(session)):
-                raise ManifestError(f"{step}: more than one graph gives {', '.join(sorted(twice))}")
+                raise ManifestError(
+                    f"{step}: more than one graph computes {', '.join(sorted(twice))}"
+                )
             known.update(_output_names(session))
     if missing := set(card.output_names) - known:
-        raise ManifestError(f"{step}: no graph gives {', '.join(sorted(missing))}")
+        raise ManifestError(f"{step}: no graph computes {', '.join(sorted(missing))}")
 
 
 def _input_names(session: InferenceSession) -> tuple[str, ...]:
@@ -194,5 +198,5 @@ def _output_names(session: InferenceSession) -> tuple[str, ...]:
 
 
 def _cores() -> int:
-    """Those that this process may use."""
+    """Count the cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,7 +1,7 @@
-"""One step of the recurrence: a rectified pair and a state, to disparity and the next state.
+"""One step of the recurrence: from a rectified pair and a state to disparity and the next state.
 
-A state is a value. A step returns the next one and changes nothing, so whoever holds the old one
-may step it again; a sequence is a pure function of its frames.
+A state is a value. A step returns the next state and changes nothing, so the old state can be
+stepped again. A sequence of disparity maps is a pure function of its frames.
 """
 
 from collections.abc import Sequence
@@ -12,9 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vergence_proto.geometry import Pose, RectifiedRig, uvd_curr_from_prev
-from vergence_proto.model_io import (
-    ModelCard,
-)
+from vergence_proto.model_io import ModelCard
 from vergence_proto.types import Image, Plane
 from vergence_service.inference.providers import Tensor
 
@@ -22,32 +20,32 @@ _NO_MOTION = np.eye(4, dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
-    """What one step looks at: a rectified pair and where its left camera was."""
+class StereoView:
+    """The input of one step: a rectified pair and the pose of its left camera."""
 
     left: Image
     right: Image  # same shape as left
     rig: RectifiedRig
     capture_ns: int
-    world_from_left: Pose | None = None  # the rectified camera's, OpenCV axes; None: not known
+    world_from_left: Pose | None = None  # pose of the rectified camera, OpenCV axes; None: unknown
     position_known: bool = True  # False: only the rotation of world_from_left can be trusted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecurrentState:
-    """What one step hands to the next: the network's tensors, and the view they belong to."""
+    """The value that one step passes to the next: tensors and the view they belong to."""
 
-    # In the order of the model card: [C, h, w], or [1, C, h, w] where it stayed on a device.
+    # In the order of the model card: [C, h, w] on the host, or [1, C, h, w] on a device.
     tensors: tuple[Tensor, ...]
     rig: RectifiedRig
     capture_ns: int
     world_from_left: Pose | None
     position_known: bool
-    step_count: int  # steps since the state was new
+    step_count: int  # steps since the last cold start
 
     @classmethod
     def after(
-        cls, view: View, previous: "RecurrentState | None", tensors: tuple[Tensor, ...]
+        cls, view: StereoView, previous: "RecurrentState | None", tensors: tuple[Tensor, ...]
     ) -> "RecurrentState":
         return cls(
             tensors=tensors,
@@ -65,11 +63,11 @@ class RecurrentState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """One row of a batch. A state is only given where it and the view have a pose."""
+    """One row of a batch. It has a state only if both the state and the view have a pose."""
 
-    view: View
+    view: StereoView
     state: RecurrentState | None  # None: a cold start
-    iterations: int  # one of the model card's
+    iterations: int  # a count that the model card lists
 
     @property
     def cold(self) -> bool:
@@ -77,9 +75,10 @@ class Step:
 
     @property
     def uvd_curr_from_prev(self) -> NDArray[np.float32]:
-        """How the camera's motion moves pixels and disparities: [4, 4].
+        """Return the motion of pixels and disparities that the camera's motion causes: [4, 4].
 
-        Rotation alone where either position is not known; the identity on a cold start.
+        It contains only the rotation if either position is unknown. It is the identity on a cold
+        start.
         """
         if (
             self.state is None
@@ -95,8 +94,10 @@ class Step:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StepResult:
+    """The output of one step."""
+
     offset_px: Plane  # u_left - u_right, finite
-    sigma_px: Plane  # its expected absolute error, finite
+    sigma_px: Plane  # expected absolute error of offset_px, finite
     state: RecurrentState
 
 
@@ -108,32 +109,34 @@ class StereoModel(Protocol):
 
     @property
     def provider(self) -> str:
-        """What it runs on, as told to clients."""
+        """The hardware or execution provider, as clients see it."""
         ...
 
     @property
     def engine(self) -> str:
-        """What computes it, with its version."""
+        """The library that runs the network, with its version."""
         ...
 
     @property
-    def lanes(self) -> int:
-        """How many threads may call ``step`` at once; above 1, a batch of several gains nothing."""
+    def max_concurrent_steps(self) -> int:
+        """The number of threads that may call ``step`` at once; above 1, batches gain nothing."""
         ...
 
     def warm_up(self, iterations: int, *cold_iterations: int) -> None:
-        """Do now what the first steps of such counts would otherwise wait for."""
+        """Load whatever the first steps with these iteration counts would wait for."""
         ...
 
     def step(self, steps: Sequence[Step]) -> list[StepResult]:
-        """One step of each stream, all of one image size and iteration count, all cold or none.
+        """Run one step of each stream.
 
-        Raises NonFinite if any row's result is not finite.
+        All steps have one image size and one iteration count, and either all or none are cold.
+
+        Raises NonFinite if the result of any row is not finite.
         """
         ...
 
 
 def state_bytes(card: ModelCard, height: int, width: int) -> int:
-    """The memory that one stream's state takes."""
+    """Return the memory that the state of one stream needs."""
     height, width = card.step_size(height, width)
     return sum(4 * int(np.prod(tensor.shape(height, width))) for tensor in card.state)

@@ -1,4 +1,4 @@
-"""A network that takes steps as ONNX graphs in onnxruntime."""
+"""A stereo model that runs as ONNX graphs in onnxruntime."""
 
 import importlib.util
 import math
@@ -18,11 +18,11 @@ from vergence_proto.model_io import (
     ModelCard,
     load_model_card,
 )
-from vergence_service.inference.graphs import StagedGraphs
+from vergence_service.inference.graphs import GraphRunner
 from vergence_service.inference.model import RecurrentState, Step, StepResult
 from vergence_service.inference.providers import (
     ENGINE,
-    Resident,
+    DeviceTensor,
     Tensor,
     device_of,
     require_provider,
@@ -30,11 +30,13 @@ from vergence_service.inference.providers import (
 
 
 class OnnxStereoModel:
-    """A model of the manifest under onnxruntime.
+    """A model of the manifest in onnxruntime.
 
-    States stay where the first provider computes them; ``states_on`` names another device.
-    ``threads`` are those of its steps together, 0 for one a core. Raises ManifestError (see
-    :func:`vergence_proto.model_io.load_model_card`) and ProviderUnavailable.
+    States stay on the device of the first provider; ``states_on`` names another device. All steps
+    share ``threads`` threads; 0 uses one per core.
+
+    Raises ManifestError if the manifest or its graphs cannot be used, and ProviderUnavailable if
+    onnxruntime cannot use a provider on this machine.
     """
 
     def __init__(
@@ -50,7 +52,7 @@ class OnnxStereoModel:
         self._card = load_model_card(weights_dir, name)
         self._provider = require_provider(providers[0])
         self._device = states_on or device_of(providers[0])
-        self._graphs = StagedGraphs(
+        self._graphs = GraphRunner(
             self._card,
             providers=[require_provider(provider) for provider in providers],
             threads=threads,
@@ -71,8 +73,8 @@ class OnnxStereoModel:
         return ENGINE
 
     @property
-    def lanes(self) -> int:
-        return self._graphs.lanes if self._device is None else 1
+    def max_concurrent_steps(self) -> int:
+        return self._graphs.max_concurrent_steps if self._device is None else 1
 
     def warm_up(self, iterations: int, *cold_iterations: int) -> None:
         self._graphs.load(iterations)
@@ -80,12 +82,12 @@ class OnnxStereoModel:
             self._graphs.load(count, cold_pixels=0)
 
     def close(self) -> None:
-        """End the threads that steps use; none may follow."""
+        """Stop the threads that steps use. No step may follow."""
         self._graphs.close()
 
     def step(self, steps: Sequence[Step]) -> list[StepResult]:
-        # Row by row where a batch gains nothing: a CPU's kernels sum in an order that depends on
-        # the batch, and a stream's answer must not depend on its neighbours.
+        # A CPU steps row by row. A batch would gain nothing there, and CPU kernels sum in an order
+        # that depends on the batch: a stream's answer must not depend on its neighbours.
         if self._device is None:
             return [result for step in steps for result in self._step([step])]
         return self._step(steps)
@@ -94,10 +96,12 @@ class OnnxStereoModel:
         height, width = steps[0].view.left.shape[:2]
         pixels = math.prod(self._card.step_size(height, width)) if steps[0].cold else None
         found = self._graphs.run(steps[0].iterations, self._feeds(steps), cold_pixels=pixels)
-        # What is not finite in a state that stays shows in the maps of the next step.
-        to_check = [values for values in found.values() if not isinstance(values, Resident)]
+        # States on a device are not checked: a bad value would show in the maps of the next step.
+        to_check = [values for values in found.values() if not isinstance(values, DeviceTensor)]
         if not all(np.isfinite(values).all() for values in to_check):
-            raise NonFinite("the network's result was not finite; the stream starts anew")
+            raise NonFinite(
+                "the network's result was not finite; the stream starts again without a state"
+            )
         disparity, sigma = _batch_on_host(found[DISPARITY]), _batch_on_host(found[SIGMA])
         states = _rows([found[tensor.output_name] for tensor in self._card.state], len(steps))
         return [
@@ -109,52 +113,54 @@ class OnnxStereoModel:
             for row, step in enumerate(steps)
         ]
 
-    def _feeds(self, steps: Sequence[Step]) -> dict[str, NDArray[np.generic] | Resident]:
+    def _feeds(self, steps: Sequence[Step]) -> dict[str, NDArray[np.generic] | DeviceTensor]:
         left = _stack([self._card.grown(step.view.left) for step in steps])
-        feeds: dict[str, NDArray[np.generic] | Resident] = {
+        feeds: dict[str, NDArray[np.generic] | DeviceTensor] = {
             LEFT: left,
             RIGHT: _stack([self._card.grown(step.view.right) for step in steps]),
             UVD_CURR_FROM_PREV: _stack([step.uvd_curr_from_prev for step in steps]),
         }
         for index, tensor in enumerate(self._card.state):
-            nothing = np.zeros(tensor.shape(*left.shape[1:3]), np.float32)
-            before = [step.state.tensors[index] if step.state else nothing for step in steps]
+            zeros = np.zeros(tensor.shape(*left.shape[1:3]), np.float32)
+            before = [step.state.tensors[index] if step.state else zeros for step in steps]
             feeds[tensor.input_name] = (
                 before[0]
-                if len(before) == 1 and isinstance(before[0], Resident)
+                if len(before) == 1 and isinstance(before[0], DeviceTensor)
                 else _stack([*map(on_host, before)])
             )
         return feeds
 
 
 def on_host(tensor: Tensor) -> NDArray[np.float32]:
-    """[C, h, w], wherever it was."""
-    return tensor.on_host()[0] if isinstance(tensor, Resident) else tensor
+    """Return the tensor of one stream in host memory: [C, h, w]."""
+    return tensor.on_host()[0] if isinstance(tensor, DeviceTensor) else tensor
 
 
 def _batch_on_host(tensor: Tensor) -> NDArray[np.float32]:
-    return tensor.on_host() if isinstance(tensor, Resident) else tensor
+    return tensor.on_host() if isinstance(tensor, DeviceTensor) else tensor
 
 
 def _rows(tensors: Sequence[Tensor], count: int) -> list[tuple[Tensor, ...]]:
-    """The states of the rows of a batch. A lone one stays where it is, several go to the host."""
-    if count == 1 and isinstance(tensors[0], Resident):
+    """Split a batch of states into rows. A single row stays on its device, several are copied."""
+    if count == 1 and isinstance(tensors[0], DeviceTensor):
         return [tuple(tensors)]
     batches = [*map(_batch_on_host, tensors)]
     return [tuple(batch[row] for batch in batches) for row in range(count)]
 
 
 def packaged_weights_dir() -> Path:
-    """The weights that were installed with the project, found without importing their package.
+    """Return the folder of the installed weights, without importing their package.
 
-    Raises FileNotFoundError if they were not.
+    Raises FileNotFoundError if no weights are installed.
     """
     spec = importlib.util.find_spec("vergence_models")
     if spec is None or not spec.submodule_search_locations:
-        raise FileNotFoundError("no weights are installed; give a folder that has a manifest.json")
+        raise FileNotFoundError(
+            "no weights are installed; name a folder with a manifest.json in model.weights"
+        )
     return Path(next(iter(spec.submodule_search_locations))) / "weights"
 
 
 def _stack(rows: Sequence[NDArray[np.generic]]) -> NDArray[np.generic]:
-    """A batch of rows; a single one is not copied."""
+    """Make a batch of rows. A single row is not copied."""
     return np.ascontiguousarray(rows[0])[None] if len(rows) == 1 else np.stack(rows)

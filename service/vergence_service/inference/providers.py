@@ -1,4 +1,4 @@
-"""What onnxruntime runs a graph on, and how a graph is run where states stay on the device."""
+"""The execution providers of onnxruntime, and runs whose states stay on the device."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,31 +9,31 @@ import onnxruntime
 from numpy.typing import NDArray
 
 ENGINE = f"onnxruntime {onnxruntime.__version__}"
-# The names a person writes in the settings, and onnxruntime's.
+# The names in the settings, and the names in onnxruntime.
 PROVIDERS: Mapping[str, str] = {
     "cpu": "CPUExecutionProvider",
     "cuda": "CUDAExecutionProvider",
     "tensorrt": "TensorrtExecutionProvider",
     "openvino": "OpenVINOExecutionProvider",
 }
-# Each of onnxruntime's wheels has some of them; only one wheel can be installed at a time.
+# Each wheel of onnxruntime contains some providers; only one wheel can be installed at a time.
 _WHEELS: Mapping[str, str] = {
     "cpu": "onnxruntime",
     "cuda": "onnxruntime-gpu",
     "tensorrt": "onnxruntime-gpu",
     "openvino": "onnxruntime-openvino",
 }
-# Those whose memory is not the host's, by onnxruntime's name of the device.
+# Providers with their own memory, and the name of their device in onnxruntime.
 _DEVICES: Mapping[str, str] = {"cuda": "cuda", "tensorrt": "cuda"}
 
 
 class ProviderUnavailable(RuntimeError):
-    """The execution provider asked for cannot be used on this machine."""
+    """A requested execution provider cannot be used on this machine."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Resident:
-    """A tensor that stays on its device; one of a state is float32."""
+class DeviceTensor:
+    """A tensor that stays on its device. Tensors of a state are float32."""
 
     value: onnxruntime.OrtValue
 
@@ -46,66 +46,69 @@ class Resident:
         return copy
 
 
-Tensor = NDArray[np.float32] | Resident
+Tensor = NDArray[np.float32] | DeviceTensor
 
 
 def require_provider(name: str) -> str:
-    """The name that onnxruntime has for it. Raises ProviderUnavailable, with what to install."""
+    """Return onnxruntime's name. Raises ProviderUnavailable with the wheel to install."""
     available = onnxruntime.get_available_providers()
     usable = [short for short, full in PROVIDERS.items() if full in available]
     if name not in usable:
         raise ProviderUnavailable(
             f"provider {name!r} is not available in the installed onnxruntime; it has "
-            f"{', '.join(usable)}. Put another wheel in its place: pip uninstall -y onnxruntime "
+            f"{', '.join(usable)}. Replace the wheel: pip uninstall -y onnxruntime "
             f"onnxruntime-gpu onnxruntime-openvino && pip install {_WHEELS[name]}"
         )
     return PROVIDERS[name]
 
 
 def device_of(name: str) -> str | None:
-    """The device that a provider's memory is on; None for the host's own."""
+    """Return the device that a provider's memory is on, or None for host memory."""
     return _DEVICES.get(name)
 
 
 def start_session(
     graph: Path, options: onnxruntime.SessionOptions, providers: Sequence[str]
 ) -> onnxruntime.InferenceSession:
-    """Load a graph; ``providers`` are onnxruntime's names. Raises ProviderUnavailable."""
+    """Load a graph; ``providers`` are onnxruntime's names.
+
+    Raises ProviderUnavailable if the first provider cannot start.
+    """
     session = onnxruntime.InferenceSession(graph, options, providers=list(providers))
-    # onnxruntime falls back to the CPU with a warning; a server must not, unasked.
+    # onnxruntime falls back to the CPU with a warning. A server must not do so silently.
     if session.get_providers()[0] != providers[0]:
         raise ProviderUnavailable(
-            f"{providers[0]} is installed but failed to start; onnxruntime's own message above "
-            "says why (a missing driver or library, most often)"
+            f"{providers[0]} is installed but failed to start; onnxruntime's message above names "
+            "the reason (usually a missing driver or library)"
         )
     return session
 
 
 def run_on_device(
     session: onnxruntime.InferenceSession,
-    feeds: Mapping[str, NDArray[np.generic] | Resident],
+    feeds: Mapping[str, NDArray[np.generic] | DeviceTensor],
     *,
     to_host: Sequence[str],
     to_stay: Sequence[str],
     device: str,
-) -> tuple[list[NDArray[np.float32]], list[Resident]]:
-    """Run a graph once: outputs copied to the host, and outputs that stay on ``device``.
+) -> tuple[list[NDArray[np.float32]], list[DeviceTensor]]:
+    """Run a graph once; return the outputs copied to the host and those left on ``device``.
 
-    What stayed is fed to the next run as it is, without a copy.
+    Outputs on the device can be inputs of the next run without a copy.
     """
     binding = session.io_binding()
     for name, value in feeds.items():
-        if isinstance(value, Resident):
+        if isinstance(value, DeviceTensor):
             binding.bind_ortvalue_input(name, value.value)
         else:
             binding.bind_cpu_input(name, np.ascontiguousarray(value))
     for name in to_host:
         binding.bind_output(name)
     for name in to_stay:
-        binding.bind_output(name, device)  # allocated there, anew for every run
+        binding.bind_output(name, device)  # every run allocates a new tensor
     binding.synchronize_inputs()
     session.run_with_iobinding(binding)
     binding.synchronize_outputs()
     outputs = binding.get_outputs()
     host = [value.numpy() for value in outputs[: len(to_host)]]
-    return host, [Resident(value) for value in outputs[len(to_host) :]]
+    return host, [DeviceTensor(value) for value in outputs[len(to_host) :]]

@@ -1,4 +1,4 @@
-"""A recurrent state as bytes, exact: whoever reads them steps on as if nothing had happened."""
+"""Recurrent states as bytes, without loss: stepping from a restored state gives the same bits."""
 
 import dataclasses
 import io
@@ -16,11 +16,11 @@ _ABOUT = "about"
 
 
 class BadSnapshot(ValueError):
-    """Bytes that hold no state, or not the whole of it."""
+    """The bytes do not contain one complete state."""
 
 
 def state_to_bytes(state: RecurrentState) -> bytes:
-    """An NPZ: the tensors by their place, and a JSON document with what else belongs to them."""
+    """Write an NPZ with the tensors, named by their index, and a JSON document with the rest."""
     pose = state.world_from_left
     about = {
         "rig": dataclasses.asdict(state.rig),
@@ -36,7 +36,7 @@ def state_to_bytes(state: RecurrentState) -> bytes:
 
 
 def state_from_bytes(data: bytes) -> RecurrentState:
-    """Raises BadSnapshot."""
+    """Read a state. Raises BadSnapshot if the bytes do not contain one complete state."""
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             about = json.loads(str(arrays[_ABOUT]))

@@ -1,7 +1,7 @@
-"""A zip or tar from a stranger, unpacked into a folder of its own, or refused.
+"""Unpack an untrusted zip or tar archive into a folder, or refuse it.
 
-Nothing in the archive is believed: sizes are counted as bytes come out, names may only lead
-downward, and what is neither a file nor a folder is refused.
+Nothing that the archive states is trusted: unpacked bytes are counted, names may only lead below
+the folder, and anything except files and folders is refused.
 """
 
 import bz2
@@ -21,21 +21,21 @@ from vergence_proto.errors import BadSequence, UploadTooLarge
 
 _CHUNK = 1 << 20
 _LONGEST_NAME = 512
-_LONGEST_PART_BYTES = 255  # of what file systems take
+_LONGEST_PART_BYTES = 255  # limit of common file systems
 _ZIP_START = b"PK"
 _DECOMPRESSORS: dict[bytes, Callable[[Path], BufferedIOBase]] = {
     b"\x1f\x8b": gzip.GzipFile,
     b"BZh": bz2.BZ2File,
     b"\xfd7zXZ": lzma.LZMAFile,
 }
-# What the standard library raises about archives that are damaged or made to confuse it.
+# Errors of the standard library about archives that are damaged or malicious.
 _DAMAGED = (
     zipfile.BadZipFile,
     tarfile.TarError,
     zlib.error,
     lzma.LZMAError,
     EOFError,
-    NotImplementedError,  # a compression that zipfile does not know
+    NotImplementedError,  # zipfile does not know the compression
     gzip.BadGzipFile,
     UnicodeError,
     ValueError,
@@ -44,9 +44,12 @@ _DAMAGED = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ArchiveLimits:
+    """The limits of one archive."""
+
     max_files: int
     max_unpacked_bytes: int
-    # Images are compressed already: an archive of them hardly shrinks, one of zeros a thousandfold.
+    # Largest unpacked size relative to the archive. Images are already compressed, so an archive of
+    # images hardly shrinks; an archive of zeros shrinks a thousandfold.
     max_ratio: float
 
 
@@ -58,10 +61,11 @@ class _Member:
 
 
 def unpack(archive: Path, folder: Path, limits: ArchiveLimits) -> None:
-    """Unpack into ``folder``, which the caller removes if this raises.
+    """Unpack into ``folder``. The caller removes the folder if this raises.
 
-    Raises BadSequence: no zip or tar, damaged, encrypted, links, or names that lead elsewhere.
-    Raises UploadTooLarge: more files, bytes or compression than ``limits`` allow.
+    Raises BadSequence if the file is not a zip or tar archive, is damaged or encrypted, or contains
+    links or names that lead out of the folder. Raises UploadTooLarge if it has more files, bytes or
+    compression than ``limits`` allow.
     """
     with archive.open("rb") as file:
         start = file.read(8)
@@ -71,13 +75,13 @@ def unpack(archive: Path, folder: Path, limits: ArchiveLimits) -> None:
     try:
         for member in members(archive, start):
             budget.take_file(member)
-            _write(member, _place(folder, member.name), budget)
+            _write(member, _target_path(folder, member.name), budget)
     except _DAMAGED as error:
-        raise BadSequence(f"expected a whole zip or tar archive: {error}") from None
+        raise BadSequence(f"expected a complete zip or tar archive: {error}") from None
 
 
 class _Budget:
-    """What may still come out of the archive."""
+    """Counts files and bytes against the limits."""
 
     def __init__(self, limits: ArchiveLimits, allowed_bytes: int) -> None:
         self._limits = limits
@@ -98,21 +102,19 @@ class _Budget:
     def _check(self, count: int) -> None:
         if count > self._allowed_bytes:
             raise UploadTooLarge(
-                f"the archive unpacks to more than {self._allowed_bytes} bytes; at most "
-                f"{self._limits.max_unpacked_bytes} are taken, and at most "
-                f"{self._limits.max_ratio:g} times the archive's size"
+                f"the archive unpacks to more than {self._allowed_bytes} bytes; the limit "
+                f"is {self._limits.max_unpacked_bytes}, and {self._limits.max_ratio:g} times the "
+                "archive's size"
             )
 
 
-def _place(folder: Path, name: str) -> Path:
-    """Where a member goes. Raises BadSequence: not below ``folder``."""
+def _target_path(folder: Path, name: str) -> Path:
+    """Return the path to unpack a member to. Raises BadSequence if it is not below ``folder``."""
     path = PurePosixPath(name)
     parts = [part for part in path.parts if part != "."]
     bad = not parts or path.is_absolute() or len(name) > _LONGEST_NAME
     if bad or any(map(_is_bad_part, parts)):
-        raise BadSequence(
-            f"expected names that lead below the archive's own folder, got {name[:100]!r}"
-        )
+        raise BadSequence(f"expected names below the archive's own folder, got {name[:100]!r}")
     return folder.joinpath(*parts)
 
 
@@ -129,7 +131,7 @@ def _write(member: _Member, path: Path, budget: _Budget) -> None:
                 budget.take_bytes(len(chunk))
                 target.write(chunk)
     except (FileExistsError, NotADirectoryError, IsADirectoryError):
-        raise BadSequence(f"the archive holds {member.name!r} twice") from None
+        raise BadSequence(f"the archive contains {member.name!r} twice") from None
 
 
 def _zip_members(archive: Path, start: bytes) -> Iterator[_Member]:
@@ -158,14 +160,14 @@ def _tar_members(archive: Path, start: bytes) -> Iterator[_Member]:
         ),
         None,
     ) or archive.open("rb")
-    small_reads = cast(IO[bytes], _SmallReads(opened))  # it has all that reading a tar needs
+    small_reads = cast(IO[bytes], _SmallReads(opened))  # it has every method that tarfile needs
     with opened, tarfile.open(fileobj=small_reads, mode="r:") as file:
         for info in file:
             if info.isdir():
                 continue
             content = file.extractfile(info) if info.isreg() and not info.issparse() else None
             if content is None:
-                raise BadSequence(f"expected files and folders only, {info.name!r} is another kind")
+                raise BadSequence(f"expected files and folders only, {info.name!r} is neither")
             yield _Member(info.name, info.size, _same(content))
 
 
@@ -174,7 +176,7 @@ def _same(content: IO[bytes]) -> Callable[[], IO[bytes]]:
 
 
 class _SmallReads:
-    """tarfile reads the extended header of a member whole, however long it says that it is."""
+    """A file that refuses huge reads: tarfile reads extended headers of any stated length."""
 
     def __init__(self, file: BufferedIOBase) -> None:
         self._file = file

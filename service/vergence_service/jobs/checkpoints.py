@@ -1,8 +1,8 @@
-"""Where a sequence stood when the server died, so that the next one goes on from there.
+"""Checkpoints of a running sequence, so that the next server can continue it after a crash.
 
-One file beside the results: a line of JSON, then the state as
-:mod:`vergence_service.inference.snapshots`
-writes it. It is replaced whole, and only when the results that it speaks of have been written.
+A checkpoint is one file beside the results: a line of JSON, then the state as
+:mod:`vergence_service.inference.snapshots` writes it. The file is replaced as a whole, and only
+after the results of its frames have been written.
 """
 
 import dataclasses
@@ -21,12 +21,13 @@ class Checkpoint:
     """A sequence after its first ``frames`` frames."""
 
     frames: int
-    state: RecurrentState  # that they left
-    weights_sha256: str  # that it belongs to
-    measured: tuple[Accuracy, ...]  # of those frames that have truth
+    state: RecurrentState  # state after these frames
+    weights_sha256: str  # weights that the state belongs to
+    measured: tuple[Accuracy, ...]  # accuracy of the frames with ground truth
 
 
 def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
+    """Replace the checkpoint at ``path``."""
     about = {
         "frames": checkpoint.frames,
         "weights_sha256": checkpoint.weights_sha256,
@@ -38,7 +39,7 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
 
 
 def read_checkpoint(path: Path) -> Checkpoint | None:
-    """None where there is none, or none that is whole: the work is done again then."""
+    """Return the checkpoint, or None if it is missing or damaged: the work is then done again."""
     try:
         first_line, _, state = path.read_bytes().partition(b"\n")
         about = json.loads(first_line)

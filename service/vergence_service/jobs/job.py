@@ -1,4 +1,4 @@
-"""What a job is: one uploaded sequence and what is to become of it."""
+"""A job: one uploaded sequence, the options of its submission, and its state."""
 
 import json
 from collections.abc import Mapping
@@ -10,29 +10,31 @@ from vergence_proto.jobs import JobState, Output
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobOptions:
-    iterations: int = 0  # of every step; 0: the server's defaults
+    """The options of a submission."""
+
+    iterations: int = 0  # iterations of every step; 0: the server's defaults
     outputs: tuple[Output, ...] = (Output.DISPARITY,)
-    metrics: bool = False  # compare with the truth, where the upload has it
+    metrics: bool = False  # compare with the ground truth, if the upload has any
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Job:
-    """One sequence and what is to become of it."""
+    """One sequence and its state. The store keeps it as JSON with these names."""
 
     job_id: str
-    source: str  # KIND:PATH below input
+    source: str  # KIND:PATH of the sequence, below the folder ``input``
     frames: int
     source_fps: float | None
-    created_s: float  # Unix time, which outlives a restart
-    client: str = ""  # the address that it came from
+    created_s: float  # Unix time, which stays valid after a restart
+    client: str = ""  # address of the client that submitted it
     options: JobOptions = field(default_factory=JobOptions)
     state: JobState = JobState.QUEUED
-    attempts: int = 0  # that ended with the server
-    finished_s: float | None = None
+    attempts: int = 0  # runs that were started and not finished
+    finished_s: float | None = None  # Unix time of its end
     fps: float | None = None
-    disk_bytes: int = 0  # reserved for it until it ends, then what it takes
+    disk_bytes: int = 0  # space reserved until the job ends, then space used
     accuracy: Mapping[str, float] | None = None
-    reason: str | None = None  # of the failure, as ErrorCode
+    reason: str | None = None  # ErrorCode of the failure
     message: str | None = None
 
     @property

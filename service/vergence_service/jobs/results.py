@@ -1,13 +1,13 @@
-"""What a job found, frame by frame on disk, and the forms in which it is handed out.
+"""The results of a job: one file per frame on disk, and the formats for download.
 
 ::
 
-    result/rig.json         the rectified rig that the maps are stated in
+    result/rig.json         the rectified rig of the maps
     result/000000.npz       offset_px float32 [H, W], NaN where there is no value; confidence uint8
-                            [H, W] where it was asked for
+                            [H, W] if the job asked for it
 
-Like the files of ``vergence run`` and of the data sets, disparity here is the pixel offset
-u_left - u_right as the images show it; depth takes the principal points into account.
+Disparity here is the pixel offset u_left - u_right in the images, as in the files of
+``vergence run`` and of the data sets. Depth takes the principal points into account.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ from vergence_proto.types import DisparityMap, Plane
 
 _RIG = "rig.json"
 _CHUNK = 1 << 20
-# Of the colours: all but the nearest and farthest hundredth of the first frame's disparities.
+# The colours cover the disparities of the first frame without the lowest and highest percent.
 _COLOUR_RANGE_PCT = (1, 99)
 
 
@@ -41,6 +41,8 @@ class CannotEncode(RuntimeError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameResult:
+    """The result of one frame."""
+
     rig: RectifiedRig
     offset_px: Plane
     confidence: NDArray[np.uint8] | None
@@ -52,7 +54,7 @@ class FrameResult:
 
 
 def start_result(folder: Path, rig: RectifiedRig) -> None:
-    """Begin anew, whatever an earlier attempt has left."""
+    """Begin a result, and delete the files of earlier attempts."""
     folder.mkdir(exist_ok=True)
     for old in folder.iterdir():
         old.unlink()
@@ -60,20 +62,21 @@ def start_result(folder: Path, rig: RectifiedRig) -> None:
 
 
 def write_frame(folder: Path, index: int, disparity: DisparityMap) -> None:
+    """Write the file of one frame."""
     arrays: dict[str, NDArray[Any]] = {"offset_px": disparity.offset_px}
     if disparity.confidence is not None:
         arrays["confidence"] = disparity.confidence
     np.savez(folder / f"{index:06d}.npz", allow_pickle=False, **arrays)
 
 
-def result_bytes(source: StereoSource, outputs: Collection[Output]) -> int:
-    """What the result of a whole sequence will take."""
-    pixels = source.rig.left.width * source.rig.left.height
-    return len(source) * pixels * (5 if Output.CONFIDENCE in outputs else 4)
+def result_bytes(sequence: StereoSource, outputs: Collection[Output]) -> int:
+    """Return the disk space that the result of a sequence will need."""
+    pixels = sequence.rig.left.width * sequence.rig.left.height
+    return len(sequence) * pixels * (5 if Output.CONFIDENCE in outputs else 4)
 
 
 def holds_frames(folder: Path, count: int) -> bool:
-    """Whether the first ``count`` are there and whole; what was written last may not be."""
+    """Check that the first ``count`` files are complete; a crash may have cut off the last."""
     try:
         RectifiedRig(**json.loads((folder / _RIG).read_text("utf-8")))
         for index in range(count):
@@ -86,6 +89,7 @@ def holds_frames(folder: Path, count: int) -> bool:
 
 
 def read_frames(folder: Path) -> Iterator[FrameResult]:
+    """Read the results in the order of the frames."""
     rig = RectifiedRig(**json.loads((folder / _RIG).read_text("utf-8")))
     for path in sorted(folder.glob("*.npz")):
         with np.load(path) as arrays:
@@ -93,7 +97,7 @@ def read_frames(folder: Path) -> Iterator[FrameResult]:
 
 
 def zip_of(folder: Path, form: ResultFormat, outputs: Collection[Output]) -> Iterator[bytes]:
-    """A zip with one file a frame and output, in pieces, as it is made."""
+    """Make a zip with one file per frame and output, and yield it in pieces."""
     sink = _Sink()
     with zipfile.ZipFile(sink, "w") as archive:
         archive.writestr(_RIG, (folder / _RIG).read_bytes())
@@ -105,7 +109,7 @@ def zip_of(folder: Path, form: ResultFormat, outputs: Collection[Output]) -> Ite
 
 
 def mp4_of(folder: Path, *, fps: float) -> Iterator[bytes]:
-    """Disparity as a film, in pieces. Raises CannotEncode, before the first of them."""
+    """Make a film of disparity, and yield it in pieces. Raises CannotEncode before the first."""
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "disparity.mp4"
         _write_mp4(path, (frame.offset_px for frame in read_frames(folder)), fps)
@@ -162,7 +166,7 @@ def _write_mp4(path: Path, frames: Iterator[Plane], fps: float) -> None:
             code = cv2.VideoWriter.fourcc(*"mp4v")
             writer = cv2.VideoWriter(str(path), code, fps, (width, height))
             if not writer.isOpened():
-                raise CannotEncode("OpenCV cannot write MP4 here; take another format")
+                raise CannotEncode("OpenCV cannot write MP4 here; choose another format")
             if known.any():
                 low, high = np.percentile(offset_px[known], _COLOUR_RANGE_PCT)
         share = (np.nan_to_num(offset_px) - low) / max(high - low, 1e-6)
@@ -175,7 +179,7 @@ def _write_mp4(path: Path, frames: Iterator[Plane], fps: float) -> None:
 
 
 class _Sink(io.RawIOBase):
-    """A file that zipfile writes to and cannot seek in, emptied between frames."""
+    """A file for zipfile that cannot seek. It is emptied between frames."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -184,7 +188,7 @@ class _Sink(io.RawIOBase):
     def writable(self) -> bool:
         return True
 
-    def write(self, data: Any) -> int:  # whatever has a buffer, as the base class takes it
+    def write(self, data: Any) -> int:  # anything with a buffer, as in the base class
         piece = bytes(data)
         self._pieces.append(piece)
         return len(piece)

@@ -1,126 +1,119 @@
-"""One run of one job: its input stepped to the last frame, its result on disk."""
+"""Run one job: step its input to the last frame and write the result to disk."""
 
 import asyncio
 import time
-from collections import deque
+from collections.abc import AsyncGenerator, AsyncIterable
 from contextlib import aclosing
-from dataclasses import dataclass, field
 from pathlib import Path
 
 from vergence_proto.accuracy import Accuracy, accuracy
-from vergence_proto.datasets import LayoutError, StereoSource
+from vergence_proto.datasets import DatasetError, StereoSource
 from vergence_proto.jobs import Output
+from vergence_proto.ordered import in_order
 from vergence_proto.types import Delivery, OutputFormat
 from vergence_service.jobs.checkpoints import Checkpoint, read_checkpoint, write_checkpoint
 from vergence_service.jobs.job import Job, JobOptions
+from vergence_service.jobs.progress import JobProgress
 from vergence_service.jobs.results import holds_frames, start_result, write_frame
 from vergence_service.jobs.sources import open_below, sequence_error, without_truth
 from vergence_service.jobs.stepping import Stepped, step_all
 from vergence_service.streams.engine import DepthEngine
-from vergence_service.streams.stream import Opening
+from vergence_service.streams.stream import StreamConfig
 
 # Frames that are being written while the next ones are stepped.
 _UNWRITTEN = 2
 _CHECKPOINT = "checkpoint"
 
 
-@dataclass(slots=True, eq=False)
-class Progress:
-    """How far a run is."""
+def job_stream_config(sequence: StereoSource, options: JobOptions) -> StreamConfig:
+    """Return the configuration of a job's stream. It is lossless, so live streams come first.
 
-    since_s: float = field(default_factory=time.monotonic)
-    frames_found: int = 0  # that an earlier run had done
-    frames_done: int = 0  # those included
-
-    @property
-    def fps(self) -> float:
-        elapsed_s = time.monotonic() - self.since_s
-        return (self.frames_done - self.frames_found) / max(elapsed_s, 1e-6)
-
-    def eta_s(self, frames: int) -> float | None:
-        """Until all ``frames`` are done; None before the first one was."""
-        return (frames - self.frames_done) / self.fps if self.fps else None
-
-
-def opening_of(source: StereoSource, options: JobOptions) -> Opening:
-    """How a sequence is stepped; lossless, so it gives way to live streams.
-
-    The iterations of a lone pair are those of its cold start, as in ``vergence run``.
+    For a single pair, the iterations are those of its cold start, as in ``vergence run``.
     """
-    return Opening(
-        source.rig,
+    return StreamConfig(
+        sequence.rig,
         delivery=Delivery.EVERY,
         output=OutputFormat(confidence=Output.CONFIDENCE in options.outputs),
         iterations=options.iterations,
-        cold_iterations=options.iterations if source.is_single_pair else 0,
+        cold_iterations=options.iterations if sequence.is_single_pair else 0,
     )
 
 
 async def run_job(
-    engine: DepthEngine, folder: Path, job: Job, progress: Progress, *, checkpoint_s: float
+    engine: DepthEngine, folder: Path, job: Job, progress: JobProgress, *, checkpoint_s: float
 ) -> Accuracy | None:
-    """Fill ``folder``/result from ``folder``/input, from where an earlier run has left it.
+    """Make ``folder``/result from ``folder``/input, continuing from the last checkpoint.
 
-    What a crash costs is at most the work of the last ``checkpoint_s``. Returns the mean accuracy
-    if the job asks for it and there is truth. Raises as step_all, and BadSequence: a file of the
-    input cannot be read.
+    A crash costs at most the work of ``checkpoint_s``. Returns the mean accuracy if the job asks
+    for it and the upload has ground truth.
+
+    Raises BadSequence if a file of the input cannot be read; NotReady or Draining if the server
+    accepts no work; and BadCalibration, FrameTooLarge, BadShape, ModelFailed or NonFinite if a
+    frame cannot be stepped.
     """
-    source = await asyncio.to_thread(open_below, folder / "input", job.source)
+    sequence = await asyncio.to_thread(open_below, folder / "input", job.source)
     if not job.options.metrics:
-        source = without_truth(source)
-    before = await asyncio.to_thread(_found, folder, engine.card.weights_sha256)
+        sequence = without_truth(sequence)
+    result = folder / "result"
+    before = await asyncio.to_thread(_usable_checkpoint, folder, engine.card.weights_sha256)
     start, state = (before.frames, before.state) if before else (0, None)
     measured = list(before.measured) if before else []
     progress.frames_found = progress.frames_done = start
     checkpoint_due_s = time.monotonic() + checkpoint_s
-    writing: deque[tuple[Stepped, asyncio.Task[Accuracy | None]]] = deque()
 
-    async def settle() -> None:
-        nonlocal checkpoint_due_s
-        stepped, written = writing.popleft()
-        found = await written
-        if found is not None:
-            measured.append(found)
-        progress.frames_done += 1
-        engine.metrics.sequence_frames.inc()
-        if time.monotonic() >= checkpoint_due_s:
-            checkpoint = Checkpoint(
-                progress.frames_done, stepped.state, engine.card.weights_sha256, tuple(measured)
-            )
-            await asyncio.to_thread(write_checkpoint, folder / _CHECKPOINT, checkpoint)
-            checkpoint_due_s = time.monotonic() + checkpoint_s
+    async def write(stepped: Stepped) -> tuple[Stepped, Accuracy | None]:
+        thread = asyncio.ensure_future(asyncio.to_thread(_write_and_measure, result, stepped))
+        try:
+            return stepped, await asyncio.shield(thread)
+        except asyncio.CancelledError:
+            await asyncio.wait([thread])  # a thread cannot be stopped
+            raise
 
-    steps = step_all(engine, source, opening_of(source, job.options), start=start, state=state)
+    config = job_stream_config(sequence, job.options)
     try:
-        async with aclosing(steps):
-            async for stepped in steps:
-                if stepped.index == 0:
-                    rig = stepped.disparity.rig
-                    await asyncio.to_thread(start_result, folder / "result", rig)
-                if len(writing) == _UNWRITTEN:
-                    await settle()
-                keep = asyncio.to_thread(_keep, folder / "result", stepped)
-                writing.append((stepped, asyncio.create_task(keep)))
-        while writing:
-            await settle()
-    except LayoutError as error:
+        async with (
+            aclosing(step_all(engine, sequence, config, start=start, state=state)) as steps,
+            aclosing(_started(result, steps)) as started,
+            # No thread writes any more when this is closed. Then the folder can be removed.
+            aclosing(in_order(started, write, limit=_UNWRITTEN, cancel_rest=False)) as written,
+        ):
+            async for stepped, found in written:
+                if found is not None:
+                    measured.append(found)
+                progress.frames_done += 1
+                engine.metrics.sequence_frames.inc()
+                if time.monotonic() >= checkpoint_due_s:
+                    checkpoint = Checkpoint(
+                        progress.frames_done,
+                        stepped.state,
+                        engine.card.weights_sha256,
+                        tuple(measured),
+                    )
+                    await asyncio.to_thread(write_checkpoint, folder / _CHECKPOINT, checkpoint)
+                    checkpoint_due_s = time.monotonic() + checkpoint_s
+    except DatasetError as error:
         raise sequence_error(error, folder / "input") from None
-    finally:
-        # Nothing is written any more once this has returned, so the folder can be removed.
-        await asyncio.gather(*(task for _, task in writing), return_exceptions=True)
     mean = Accuracy.mean(measured)
     return mean if mean.n else None
 
 
-def _found(folder: Path, weights_sha256: str) -> Checkpoint | None:
-    """What can be gone on from: all of a result comes from the same weights."""
+async def _started(result: Path, steps: AsyncIterable[Stepped]) -> AsyncGenerator[Stepped, None]:
+    """Pass the steps on. Empty the result's folder before the first frame of the sequence."""
+    async for stepped in steps:
+        if stepped.index == 0:
+            await asyncio.to_thread(start_result, result, stepped.disparity.rig)
+        yield stepped
+
+
+def _usable_checkpoint(folder: Path, weights_sha256: str) -> Checkpoint | None:
+    """Return the checkpoint to continue from: a result must come from one set of weights."""
     checkpoint = read_checkpoint(folder / _CHECKPOINT)
     if checkpoint is None or checkpoint.weights_sha256 != weights_sha256:
         return None
     return checkpoint if holds_frames(folder / "result", checkpoint.frames) else None
 
 
-def _keep(folder: Path, stepped: Stepped) -> Accuracy | None:
+def _write_and_measure(folder: Path, stepped: Stepped) -> Accuracy | None:
     write_frame(folder, stepped.index, stepped.disparity)
     source = stepped.source
     if source.truth_px is None:

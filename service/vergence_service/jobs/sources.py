@@ -1,11 +1,14 @@
-"""Find and open the sequence in an upload's folder."""
+"""Find and open the sequence in the folder of an upload.
+
+A *source* is text, KIND:PATH, as clients write it. A *sequence* is an opened source.
+"""
 
 import dataclasses
 from pathlib import Path
 
 from vergence_proto.datasets import (
-    LAYOUTS,
-    LayoutError,
+    DATASETS,
+    DatasetError,
     StereoSource,
     find_sources,
     open_source,
@@ -15,58 +18,61 @@ from vergence_proto.errors import BadSequence
 _NAMED_AT_MOST = 12
 
 
-def without_truth(source: StereoSource) -> StereoSource:
-    """The same frames, without the time that it takes to read what is known about them."""
-    files = [dataclasses.replace(each, read_truth=None) for each in source.files]
-    return dataclasses.replace(source, files=files)
+def without_truth(sequence: StereoSource) -> StereoSource:
+    """Return the same frames without their ground truth, which takes time to read."""
+    files = [dataclasses.replace(each, read_truth=None) for each in sequence.files]
+    return dataclasses.replace(sequence, files=files)
 
 
-def find_sequence(folder: Path, wanted: str | None) -> str:
-    """The one source in or under ``folder``, or the ``wanted`` one, as KIND:PATH below it.
+def find_sequence(folder: Path, source: str | None) -> tuple[str, StereoSource]:
+    """Find the sequence below ``folder``; return its source and the opened sequence.
 
-    Raises BadSequence: there is none, there are several and none is wanted, or it is damaged.
+    Raises BadSequence if the source cannot be opened, or if there is no source and ``folder`` does
+    not contain exactly one sequence.
     """
-    if wanted is not None:
-        open_below(folder, wanted)
-        return wanted
-    found, trouble = [], []
-    for kind in LAYOUTS:
+    if source is not None:
+        return source, open_below(folder, source)
+    found: list[tuple[str, StereoSource]] = []
+    trouble: list[str] = []
+    for kind in DATASETS:
         for spec in find_sources(f"{kind}:{folder}"):
             try:
-                open_source(spec)
-            except LayoutError as error:
+                found.append((_relative(spec, folder), open_source(spec)))
+            except DatasetError as error:
                 trouble.append(_relative(str(error), folder))
-            else:
-                found.append(_relative(spec, folder))
     if not found:
         why = f" ({trouble[0]})" if trouble else ""
-        raise BadSequence(f"expected a sequence in one of {', '.join(LAYOUTS)}, found none{why}")
+        raise BadSequence(f"expected a sequence in one of {', '.join(DATASETS)}, found none{why}")
     if len(found) > 1:
-        named = ", ".join(found[:_NAMED_AT_MOST])
-        raise BadSequence(f"expected one sequence; take one with source=KIND:PATH: {named}")
-    return found[0]
+        named = ", ".join(source for source, _ in found[:_NAMED_AT_MOST])
+        raise BadSequence(f"expected one sequence; choose one with source=KIND:PATH: {named}")
+    return _not_empty(*found[0])
 
 
-def open_below(folder: Path, spec: str) -> StereoSource:
+def open_below(folder: Path, source: str) -> StereoSource:
     """Open KIND:PATH below ``folder``.
 
-    Raises BadSequence: it leads out of the folder, has no frames, or as
-    :func:`vergence_proto.datasets.open_source`.
+    Raises BadSequence if the path leads out of the folder, if the files there are not a sequence of
+    this kind, or if it has no frames.
     """
-    kind, _, path = spec.partition(":")
+    kind, _, path = source.partition(":")
     if not (folder / path.partition("?")[0]).resolve().is_relative_to(folder.resolve()):
-        raise BadSequence(f"expected a path below the upload's own folder, got {spec!r}")
+        raise BadSequence(f"expected a path below the upload's own folder, got {source!r}")
     try:
-        source = open_source(f"{kind}:{folder}/{path}" if path else f"{kind}:{folder}")
-    except LayoutError as error:
+        sequence = open_source(f"{kind}:{folder}/{path}" if path else f"{kind}:{folder}")
+    except DatasetError as error:
         raise sequence_error(error, folder) from None
-    if len(source) == 0:
-        raise BadSequence(f"{spec}: no frames")
-    return source
+    return _not_empty(source, sequence)[1]
 
 
-def sequence_error(error: LayoutError, folder: Path) -> BadSequence:
-    """What was wrong with a file below ``folder``, without saying where the server keeps it."""
+def _not_empty(source: str, sequence: StereoSource) -> tuple[str, StereoSource]:
+    if len(sequence) == 0:
+        raise BadSequence(f"{source}: no frames")
+    return source, sequence
+
+
+def sequence_error(error: DatasetError, folder: Path) -> BadSequence:
+    """Return the error about a file below ``folder``, without the server's own path."""
     return BadSequence(_relative(str(error), folder))
 
 

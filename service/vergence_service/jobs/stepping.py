@@ -1,64 +1,56 @@
-"""A whole sequence as one pure function of its frames and the model, and where to find one."""
+"""Step a whole sequence: a pure function of its frames and the model."""
 
-import asyncio
-from collections import deque
 from collections.abc import AsyncGenerator
+from contextlib import aclosing
 from dataclasses import dataclass
 
-from vergence_proto.datasets import (
-    SourceFrame,
-    StereoSource,
-    read_ahead,
-)
+from vergence_proto.datasets import SourceFrame, StereoSource, read_ahead
+from vergence_proto.ordered import in_order
 from vergence_proto.types import DisparityMap
 from vergence_service.inference.model import RecurrentState
 from vergence_service.streams.engine import DepthEngine
-from vergence_service.streams.stream import Opening, Stream
+from vergence_service.streams.stream import StreamConfig
 
-# One step is in the model while the answer of the one before is made ready.
+# One frame is in the model while the map of the frame before is made.
 _IN_FLIGHT = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stepped:
-    """One frame of a sequence and what came of it."""
+    """One frame of a sequence and its result."""
 
-    index: int  # from 0
+    index: int  # position in the sequence, from 0
     source: SourceFrame
     disparity: DisparityMap
-    state: RecurrentState  # that it left
+    state: RecurrentState  # state after this frame
 
 
 async def step_all(
     engine: DepthEngine,
-    source: StereoSource,
-    opening: Opening,
+    sequence: StereoSource,
+    config: StreamConfig,
     *,
     start: int = 0,
     state: RecurrentState | None = None,
 ) -> AsyncGenerator[Stepped, None]:
-    """Every frame of ``source`` in order, each on the state that its predecessor left.
+    """Step the frames of ``sequence`` in order, each from the state after the frame before.
 
-    Or every one from ``start`` on, whose predecessor left ``state``.
+    Stepping begins at frame ``start``, from ``state``, the state after the frame before it.
 
-    Raises what DepthEngine.open_apart and step_apart raise; LayoutError: a file cannot be read.
+    Raises NotReady or Draining if the server accepts no work; BadCalibration, FrameTooLarge,
+    BadShape, ModelFailed or NonFinite if a frame cannot be stepped; and DatasetError if a file
+    cannot be read.
     """
-    stream = await engine.open_apart(opening, state=state)
-    frames = read_ahead(source, start=start)
-    waiting: deque[asyncio.Task[Stepped]] = deque()
-    try:
-        async for index, frame in frames:
-            if len(waiting) == _IN_FLIGHT:
-                yield await waiting.popleft()
-            waiting.append(asyncio.create_task(_step(engine, stream, index, frame)))
-        while waiting:
-            yield await waiting.popleft()
-    finally:
-        for task in waiting:
-            task.cancel()
-        await asyncio.gather(*waiting, frames.aclose(), return_exceptions=True)
+    stream = await engine.open_offline(config, state=state)
 
+    async def step(frame: tuple[int, SourceFrame]) -> Stepped:
+        index, source = frame
+        disparity, state = await engine.step_offline(stream, lambda: source.frame)
+        return Stepped(index, source, disparity, state)
 
-async def _step(engine: DepthEngine, stream: Stream, index: int, source: SourceFrame) -> Stepped:
-    disparity, state = await engine.step_apart(stream, lambda: source.frame)
-    return Stepped(index, source, disparity, state)
+    async with (
+        aclosing(read_ahead(sequence, start=start)) as frames,
+        aclosing(in_order(frames, step, limit=_IN_FLIGHT)) as steps,
+    ):
+        async for stepped in steps:
+            yield stepped

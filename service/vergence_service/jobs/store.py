@@ -1,10 +1,10 @@
-"""Jobs that outlive the process: a folder of files, and one SQLite table that says what they are.
+"""The jobs on disk: a folder of files and one SQLite table. They survive the process.
 
 ::
 
-    DIRECTORY/jobs.sqlite3        a row a job; a job is accepted once its row is committed
-    DIRECTORY/incoming/ID/        uploads that are not accepted yet; emptied at every start
-    DIRECTORY/jobs/ID/input       what was uploaded, unpacked; removed when the job ends
+    DIRECTORY/jobs.sqlite3        one row per job; a job is accepted when its row is committed
+    DIRECTORY/incoming/ID/        uploads that are not accepted yet; removed at every start
+    DIRECTORY/jobs/ID/input       the unpacked upload; removed when the job ends
     DIRECTORY/jobs/ID/checkpoint  progress, see :mod:`vergence_service.jobs.checkpoints`
     DIRECTORY/jobs/ID/result      see :mod:`vergence_service.jobs.results`
 """
@@ -23,10 +23,10 @@ from vergence_service.jobs.job import Job, job_from_json, job_to_json
 
 
 class StoreUnavailable(OSError):
-    """The folder of the jobs cannot be used, or another server uses it."""
+    """The folder of the jobs cannot be written, or another server uses it."""
 
 
-# Columns that queries and people need; what the rest of a job says is in one JSON document.
+# Columns for queries and for people. The JSON document contains the whole job.
 _TABLE = """
 CREATE TABLE IF NOT EXISTS jobs (
     job_id TEXT PRIMARY KEY,
@@ -38,9 +38,10 @@ CREATE TABLE IF NOT EXISTS jobs (
 
 
 class JobStore:
-    """All methods block; call them from one thread at a time each, from any.
+    """The jobs of one server on disk. All methods block; any thread may call them.
 
-    Raises StoreUnavailable on entering: the folder cannot be written, or is another server's.
+    Entering the context raises StoreUnavailable if the folder cannot be written, or if another
+    server uses it.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -54,24 +55,25 @@ class JobStore:
             self._database = sqlite3.connect(
                 self._directory / "jobs.sqlite3",
                 timeout=0,
-                isolation_level=None,  # every statement is a transaction of its own
+                isolation_level=None,  # every statement is its own transaction
                 check_same_thread=False,
             )
         except (OSError, sqlite3.Error) as error:
             raise StoreUnavailable(f"cannot keep jobs in {self._directory}: {error}") from None
         try:
-            # Exclusive from the first access to the end of the process, however it ends: two
-            # servers that ran the same jobs would write over each other.
+            # The lock lasts from the first access to the end of the process, however it ends. Two
+            # servers that ran the same jobs would overwrite each other's files.
             self._database.execute("PRAGMA locking_mode = EXCLUSIVE")
             self._database.execute("PRAGMA journal_mode = WAL")
-            self._database.execute("PRAGMA synchronous = FULL")  # accepted survives a power cut
+            # An accepted job survives a power cut.
+            self._database.execute("PRAGMA synchronous = FULL")
             self._database.execute(_TABLE)
             self._clear_leftovers()
         except sqlite3.Error as error:
             self._database.close()
             raise StoreUnavailable(
-                f"cannot keep jobs in {self._directory}: {error}; if another server keeps its own "
-                "there, give this one another folder with batch.directory"
+                f"cannot keep jobs in {self._directory}: {error}; if another server uses this "
+                "folder, choose another one with batch.directory"
             ) from None
         return self
 
@@ -79,19 +81,19 @@ class JobStore:
         self._database.close()
 
     def load(self) -> list[Job]:
-        """Every job, oldest first."""
+        """Read all jobs, oldest first."""
         with self._turn:
             rows = self._database.execute("SELECT document FROM jobs ORDER BY created_s").fetchall()
         return [job_from_json(document) for (document,) in rows]
 
     def new_folder(self) -> Path:
-        """An empty folder for an upload; the next start removes it unless it is accepted."""
+        """Make an empty folder for an upload. The next start removes it unless it is accepted."""
         folder = self._directory / "incoming" / secrets.token_hex(8)
         folder.mkdir()
         return folder
 
-    def accept(self, folder: Path, job: Job) -> None:
-        """Take an upload over; the job survives whatever happens to the process from here on."""
+    def insert(self, folder: Path, job: Job) -> None:
+        """Add a job and move its upload to its folder. A crash after this does not lose it."""
         _flush()
         folder.rename(self.folder(job.job_id))
         with self._turn:
@@ -101,7 +103,7 @@ class JobStore:
             )
 
     def update(self, job: Job) -> None:
-        """Say how the job stands; of one that was deleted nothing comes back."""
+        """Replace the row of a job, unless it was deleted."""
         if job.ended:
             _flush()
         with self._turn:
@@ -111,16 +113,17 @@ class JobStore:
             )
 
     def delete(self, job_id: str) -> None:
-        """The row first: a crash in between leaves files, which the next start removes."""
+        """Delete the row, then the files. After a crash in between, the next start removes them."""
         with self._turn:
             self._database.execute("DELETE FROM jobs WHERE job_id = ?", (job_id,))
         remove_folder(self.folder(job_id))
 
     def folder(self, job_id: str) -> Path:
+        """Return the folder of a job."""
         return self._directory / "jobs" / job_id
 
     def tidy(self, job: Job) -> None:
-        """Remove what a job that has ended does not need any more."""
+        """Remove the files that an ended job does not need."""
         remove_folder(self.folder(job.job_id) / "input")
         (self.folder(job.job_id) / "checkpoint").unlink(missing_ok=True)
         if job.state is JobState.FAILED:
@@ -139,15 +142,16 @@ class JobStore:
 
 
 def _flush() -> None:
-    """All files to the disk at once, before the row that promises them."""
+    """Write all files to the disk, before the row that promises them."""
     if sys.platform != "win32":
         os.sync()
 
 
 def remove_folder(folder: Path) -> None:
-    """Whatever is left of it, if it is still there."""
+    """Remove a folder with its content, if it exists."""
     shutil.rmtree(folder, ignore_errors=True)
 
 
 def folder_bytes(folder: Path) -> int:
+    """Return the size of all files in a folder."""
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())

@@ -1,6 +1,6 @@
-"""Files from a stranger, looked at before anything reads them, for the memory they would take.
+"""Check untrusted files for the memory that reading them would need, before anything reads them.
 
-An image of a few kilobytes may be stated to have a billion pixels, and decoders believe it.
+An image of a few kilobytes may claim a billion pixels, and decoders trust the claim.
 """
 
 import zipfile
@@ -9,10 +9,10 @@ from pathlib import Path
 from vergence_proto.codec.images import image_size
 from vergence_proto.errors import BadImage, BadSequence, FrameTooLarge
 
-# Sixteen bits a channel with alpha, the most that a PNG has, or disparity in float64.
+# The largest pixel: a PNG with alpha and 16 bits per channel, or disparity in float64.
 _BYTES_A_PIXEL = 8
 _BEYOND_PIXELS = 1 << 20
-# OpenCV reads these too, but their size is deep inside, and no layout needs them.
+# OpenCV reads these too, but their size is hard to find, and no data set layout needs them.
 _REFUSED_KINDS = {
     b"II*\0": "TIFF",
     b"MM\0*": "TIFF",
@@ -27,33 +27,41 @@ _REFUSED_KINDS = {
 
 
 def check_folder(folder: Path, *, max_pixels: int) -> None:
-    """Raises FrameTooLarge, BadSequence: a file that nothing here should read."""
+    """Check all files below ``folder``.
+
+    Raises FrameTooLarge if a file or an image is too large, and BadSequence if it is damaged or of
+    an unknown kind.
+    """
     for path in folder.rglob("*"):
         if path.is_file():
             try:
                 check_file(path, max_pixels=max_pixels)
             except (BadImage, FrameTooLarge) as error:
-                told = FrameTooLarge if isinstance(error, FrameTooLarge) else BadSequence
-                raise told(f"{path.relative_to(folder)}: {error}") from None
+                kind = FrameTooLarge if isinstance(error, FrameTooLarge) else BadSequence
+                raise kind(f"{path.relative_to(folder)}: {error}") from None
 
 
 def check_file(path: Path, *, max_pixels: int) -> None:
-    """Raises FrameTooLarge; BadImage: an image that is damaged or of a kind that is not taken."""
+    """Check one file.
+
+    Raises FrameTooLarge if the file or its image is too large, and BadImage if the image is damaged
+    or of an unknown kind.
+    """
     most_bytes = max_pixels * _BYTES_A_PIXEL + _BEYOND_PIXELS
     if (size := path.stat().st_size) > most_bytes:
         raise FrameTooLarge(f"expected a file of at most {most_bytes} bytes, got {size}")
     with path.open("rb") as file:
         start = file.read(16)
-    if start.startswith(b"PK"):  # .npz, by whatever name
+    if start.startswith(b"PK"):  # an .npz file, whatever its name
         _check_arrays(path, most_bytes)
     if start[4:8] == b"ftyp":
-        raise BadImage("expected PNG, JPEG or WebP, got AVIF or a film")
+        raise BadImage("expected PNG, JPEG or WebP, got AVIF or a video")
     for magic, kind in _REFUSED_KINDS.items():
         if start.startswith(magic):
             raise BadImage(f"expected PNG, JPEG or WebP, got {kind}")
     if (pixels := image_size(path.read_bytes())) and pixels[0] * pixels[1] > max_pixels:
         raise FrameTooLarge(
-            f"expected at most {max_pixels} pixels an image, got {pixels[0]}x{pixels[1]}"
+            f"expected at most {max_pixels} pixels per image, got {pixels[0]}x{pixels[1]}"
         )
 
 
@@ -62,6 +70,6 @@ def _check_arrays(path: Path, most_bytes: int) -> None:
         with zipfile.ZipFile(path) as archive:
             unpacked = sum(info.file_size for info in archive.infolist())
     except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
-        raise BadImage(f"no readable .npz: {error}") from None
+        raise BadImage(f"expected a readable .npz file: {error}") from None
     if unpacked > most_bytes:
         raise FrameTooLarge(f"expected at most {most_bytes} bytes of arrays, got {unpacked}")

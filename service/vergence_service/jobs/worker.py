@@ -1,163 +1,144 @@
-"""Accepted sequences, stepped one after the other."""
+"""The worker: it runs the accepted jobs one after the other."""
 
 import asyncio
 import logging
-import time
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 
 from vergence_proto.errors import DepthError, Draining, ModelFailed, NotReady
 from vergence_proto.jobs import JobState
 from vergence_service.jobs.job import Job
-from vergence_service.jobs.registry import JobShelf
-from vergence_service.jobs.run import Progress, run_job
+from vergence_service.jobs.progress import JobProgress
+from vergence_service.jobs.registry import JobRegistry
+from vergence_service.jobs.run import run_job
 from vergence_service.streams.engine import DepthEngine
 
 log = logging.getLogger(__name__)
 
-# A sequence that was running so often when the server died is taken to be the cause.
+# After this many crashes while the same job was running, fail the job: it probably causes them.
 _MAX_ATTEMPTS = 4
 _EXPIRE_EVERY_S = 30.0
-# Before trying again what the disk refused.
+# Pause before trying again when the disk refused to write.
 _TROUBLE_PAUSE_S = 5.0
-# What a job is taken to need before one has run; clients are told to come back after it.
-_USUAL_JOB_S = 2.0
 
 
 @dataclass(slots=True, eq=False)
-class _Running:
-    progress: Progress = field(default_factory=Progress)
+class _Run:
+    """One run of one job."""
+
+    progress: JobProgress
     task: asyncio.Task[None] | None = None
-    stepped: asyncio.Event = field(default_factory=asyncio.Event)  # the model is free again
+    stepped: asyncio.Event = field(default_factory=asyncio.Event)  # set when the model is free
 
 
 class JobWorker:
-    """Steps one job of the shelf at a time, so that a sequence is done as early as it can be."""
+    """Steps one job at a time, so that every sequence is done as early as possible."""
 
-    def __init__(self, engine: DepthEngine, shelf: JobShelf, *, checkpoint_s: float) -> None:
+    def __init__(self, engine: DepthEngine, jobs: JobRegistry, *, checkpoint_s: float) -> None:
         self._engine = engine
-        self._shelf = shelf
+        self._jobs = jobs
         self._checkpoint_s = checkpoint_s
-        self._running: dict[str, _Running] = {}  # at most one is stepped, one is being put away
+        self._runs: dict[str, _Run] = {}  # at most two: one is stepped, one is finished
         self._leaving = False  # the server is shutting down
-        self._last_job_s = _USUAL_JOB_S
         self._tasks: list[asyncio.Task[None]] = []
         self._metrics = engine.metrics
-        self._metrics.sequence_disk_bytes.set_function(shelf.taken_bytes)
+        self._metrics.sequence_disk_bytes.set_function(jobs.used_bytes)
         for state in (JobState.QUEUED, JobState.RUNNING):
-            self._metrics.sequences.labels(state).set_function(partial(shelf.count, state))
+            self._metrics.sequences.labels(state).set_function(partial(jobs.count, state))
 
     def start(self) -> None:
-        """Run what waits, that of earlier servers first, until :meth:`stop`."""
+        """Run the waiting jobs, those of earlier servers first, until :meth:`stop`."""
         self._tasks = [
             asyncio.create_task(self._run_all(), name="sequences"),
-            asyncio.create_task(self._expire_now_and_then(), name="expire results"),
+            asyncio.create_task(self._expire_regularly(), name="expire results"),
         ]
 
     async def stop(self) -> None:
+        """Stop at the current frame. The running job keeps its place for the next server."""
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
-    def progress(self, job_id: str) -> Progress | None:
-        """How far a job is; None if it does not run."""
-        running = self._running.get(job_id)
-        return None if running is None else running.progress
-
     async def cancel(self, job_id: str) -> None:
-        """End the job's run, if it runs."""
-        running = self._running.get(job_id)
-        if running is not None and running.task is not None:
-            running.task.cancel()
-            await asyncio.gather(running.task, return_exceptions=True)
-
-    def usual_job_s(self) -> float:
-        """How long until a place is free, as far as anybody can tell."""
-        etas_s = [
-            running.progress.eta_s(self._shelf.get(job_id).frames)
-            for job_id, running in self._running.items()
-            if job_id in self._shelf
-        ]
-        return max((eta_s for eta_s in etas_s if eta_s is not None), default=self._last_job_s)
+        """End the run of a job, if it runs."""
+        run = self._runs.get(job_id)
+        if run is not None and run.task is not None:
+            run.task.cancel()
+            await asyncio.gather(run.task, return_exceptions=True)
 
     async def _run_all(self) -> None:
         async with asyncio.TaskGroup() as tasks:
             before: asyncio.Task[None] | None = None
             while not self._leaving:
-                waiting = self._shelf.unfinished()
-                job = next((each for each in waiting if each.job_id not in self._running), None)
+                waiting = self._jobs.unfinished()
+                job = next((each for each in waiting if each.job_id not in self._runs), None)
                 if job is None:
-                    await self._shelf.change(within_s=_EXPIRE_EVERY_S)
+                    await self._jobs.change(within_s=_EXPIRE_EVERY_S)
                     continue
-                running = self._running[job.job_id] = _Running()
-                name = f"sequence {job.job_id}"
-                running.task = tasks.create_task(self._run(job, running), name=name)
-                # While one is put away the next is stepped, and no more: disks can be slow.
-                await running.stepped.wait()
+                run = self._runs[job.job_id] = _Run(self._jobs.begin_run(job.job_id))
+                run.task = tasks.create_task(self._run(job, run), name=f"sequence {job.job_id}")
+                # The next job is stepped while this one is finished, for disks can be slow. A third
+                # one has to wait.
+                await run.stepped.wait()
                 if before is not None:
                     await asyncio.wait([before])
-                before = running.task
+                before = run.task
 
-    async def _run(self, job: Job, running: _Running) -> None:
+    async def _run(self, job: Job, run: _Run) -> None:
         try:
             try:
-                ended = await self._stepped(job, running)
+                ended = await self._stepped(job, run.progress)
             finally:
-                self._last_job_s = time.monotonic() - running.progress.since_s
-                running.stepped.set()
-            # Before anybody can hear of the end in another way.
-            self._count_ended(ended, running.progress)
-            await self._shelf.put_away(ended)
+                self._jobs.end_stepping(job.job_id)
+                run.stepped.set()
+            # Count first: clients must not see the end of the job before the metrics do.
+            self._count_ended(ended, run.progress)
+            await self._jobs.finish(ended)
         except (Draining, NotReady):
             self._leaving = True
-        except Exception:  # a full disk, most likely: the job keeps its place
+        except Exception:  # most likely a full disk: the job keeps its place
             log.exception("the state of sequence %s could not be kept", job.job_id)
             await asyncio.sleep(_TROUBLE_PAUSE_S)
         finally:
-            del self._running[job.job_id]
+            self._jobs.end_run(job.job_id)
+            del self._runs[job.job_id]
 
-    async def _stepped(self, job: Job, running: _Running) -> Job:
-        """The job as it is after its frames were stepped, or one of them was not."""
+    async def _stepped(self, job: Job, progress: JobProgress) -> Job:
+        """Step the frames of a job; return the job as it is after success or failure."""
         if job.attempts >= _MAX_ATTEMPTS:
             return _failed(
                 job, ModelFailed(f"the server died {job.attempts} times while it ran this sequence")
             )
         started = replace(job, state=JobState.RUNNING, attempts=job.attempts + 1)
-        await self._shelf.update(started)
+        await self._jobs.update(started)
 
         try:
-            folder = self._shelf.folder(job.job_id)
+            folder = self._jobs.folder(job.job_id)
             found = await run_job(
-                self._engine,
-                folder,
-                started,
-                running.progress,
-                checkpoint_s=self._checkpoint_s,
+                self._engine, folder, started, progress, checkpoint_s=self._checkpoint_s
             )
         except (Draining, NotReady, asyncio.CancelledError):
-            # Not the sequence's doing: it keeps its place, for this server or the next one.
-            await self._shelf.update(replace(job, state=JobState.QUEUED))
+            # The sequence did not cause this: it keeps its place, for this server or the next.
+            await self._jobs.update(replace(job, state=JobState.QUEUED))
             raise
         except DepthError as error:
             return _failed(started, error)
         except Exception:
-            log.exception("sequence %s failed in a way that nobody foresaw", job.job_id)
-            return _failed(started, ModelFailed("the server failed; its log says why"))
+            log.exception("sequence %s failed with an unexpected error", job.job_id)
+            return _failed(started, ModelFailed("the server failed; its log has the reason"))
         accuracy = None if found is None else asdict(found)
-        return replace(
-            started, state=JobState.DONE, fps=running.progress.fps or None, accuracy=accuracy
-        )
+        return replace(started, state=JobState.DONE, fps=progress.fps or None, accuracy=accuracy)
 
-    def _count_ended(self, job: Job, progress: Progress) -> None:
+    def _count_ended(self, job: Job, progress: JobProgress) -> None:
         if job.state is JobState.DONE:
             self._metrics.sequences_done.inc()
-            self._metrics.sequence_s.observe(time.monotonic() - progress.since_s)
+            self._metrics.sequence_s.observe(progress.elapsed_s)
         else:
             self._metrics.sequences_failed.labels(job.reason).inc()
 
-    async def _expire_now_and_then(self) -> None:
+    async def _expire_regularly(self) -> None:
         while True:
-            await self._shelf.expire()
+            await self._jobs.expire()
             await asyncio.sleep(_EXPIRE_EVERY_S)
 
 

@@ -1,24 +1,26 @@
-"""Whether a state can be continued by the next view, or the stream must start anew, and why."""
+"""Decide whether a stream may continue from its previous state, or must start without one."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 from vergence_proto.types import Origin
-from vergence_service.inference.model import RecurrentState, View
+from vergence_service.inference.model import RecurrentState, StereoView
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ContinuityLimits:
-    """What may lie between two stepped frames of one stream."""
+    """The largest differences between two stepped frames of one stream that keep the state."""
 
     max_gap_s: float
     max_jump_m: float
     max_jump_deg: float
 
 
-def break_between(state: RecurrentState, view: View, limits: ContinuityLimits) -> Origin | None:
-    """The reason why ``view`` cannot continue ``state``, or None if it can."""
+def break_between(
+    state: RecurrentState, view: StereoView, limits: ContinuityLimits
+) -> Origin | None:
+    """Return the reason why ``view`` cannot continue from ``state``, or None if it can."""
     if view.world_from_left is None or state.world_from_left is None:
         return Origin.RESET_POSE_LOST
     if view.capture_ns < state.capture_ns:

@@ -1,4 +1,4 @@
-"""The border between a client's frames and the model's views: rectification, axes, no values."""
+"""Convert between a client's frames and the model's views: rectification, axes, missing values."""
 
 from dataclasses import dataclass
 
@@ -8,16 +8,15 @@ from numpy.typing import NDArray
 from vergence_proto.errors import BadShape
 from vergence_proto.geometry import Axes, Pose
 from vergence_proto.types import DisparityMap, Origin, Plane, StereoFrame, Timings
-from vergence_service.inference.batcher import TimedResult
-from vergence_service.inference.model import View
+from vergence_service.inference.model import StepResult, StereoView
 from vergence_service.streams.rectify import Rectifier
 from vergence_service.streams.stream import Stream
 
 
-def view_of(frame: StereoFrame, rectifier: Rectifier, axes: Axes) -> View:
-    """The frame as the model sees it: rectified, its pose in OpenCV axes.
+def view_from_frame(frame: StereoFrame, rectifier: Rectifier, axes: Axes) -> StereoView:
+    """Convert a frame to the model's input: rectified images, and the pose in OpenCV axes.
 
-    Raises BadShape: images of another size than the rig's.
+    Raises BadShape if the images do not have the size of the rig.
     """
     rig = rectifier.rig
     height, width = frame.left.shape[:2]
@@ -32,34 +31,35 @@ def view_of(frame: StereoFrame, rectifier: Rectifier, axes: Axes) -> View:
         world_from_left = axes.to_opencv(frame.pose.world_from_left)
         world_from_rectified = world_from_left @ rectifier.left_from_rectified
     position_known = frame.pose is not None and frame.pose.position_valid
-    return View(left, right, rig, frame.capture_ns, world_from_rectified, position_known)
+    return StereoView(left, right, rig, frame.capture_ns, world_from_rectified, position_known)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Answer:
-    """A step that was taken, on its way to becoming a disparity map."""
+class SteppedFrame:
+    """A frame that was stepped, before its answer is made."""
 
     stream: Stream
     frame_id: int
-    view: View
-    timed: TimedResult
+    arrived_s: float
+    view: StereoView
+    result: StepResult
     origin: Origin
     iterations: int
     frames_skipped: int
-    timings: Timings
+    timings: Timings  # up to the end of the step
 
     def disparity_map(self) -> DisparityMap:
-        """Works on whole images: to be called in a worker thread."""
-        result, opening = self.timed.result, self.stream.opening
+        """Make the answer. This works on whole images: call it in a worker thread."""
+        result, config = self.result, self.stream.config
         pose = self.view.world_from_left
         return DisparityMap(
             frame_id=self.frame_id,
             capture_ns=self.view.capture_ns,
             rig=self.view.rig,
             disparity_px=_disparity_px(result.offset_px, self.stream.rectifier),
-            sigma_px=result.sigma_px if opening.output.sigma else None,
-            confidence=_confidence(result.sigma_px) if opening.output.confidence else None,
-            world_from_left=None if pose is None else opening.axes.from_opencv(pose),
+            sigma_px=result.sigma_px if config.output.sigma else None,
+            confidence=_confidence(result.sigma_px) if config.output.confidence else None,
+            world_from_left=None if pose is None else config.axes.from_opencv(pose),
             origin=self.origin,
             step_count=result.state.step_count,
             iterations=self.iterations,
@@ -69,19 +69,19 @@ class Answer:
 
 
 def _disparity_px(offset_px: Plane, rectifier: Rectifier) -> Plane:
-    """Pixel offset to disparity: NaN where it is not positive or the camera saw nothing."""
+    """Convert pixel offset to disparity: NaN if it is not positive or the camera saw nothing."""
     disparity_px = offset_px - np.float32(rectifier.rig.offset_of_zero_disparity_px)
-    there = disparity_px > 0
+    valid = disparity_px > 0
     if rectifier.seen is not None:
-        there &= rectifier.seen
-    disparity_px[~there] = np.nan
+        valid &= rectifier.seen
+    disparity_px[~valid] = np.nan
     return disparity_px
 
 
 def _confidence(sigma_px: Plane) -> NDArray[np.uint8]:
-    """The probability of an error below one pixel, times 255.
+    """Return the probability of an error below one pixel, times 255.
 
-    Of a Laplace distribution, whose expected absolute error is its scale.
+    The error is modelled as a Laplace distribution, whose expected absolute error is its scale.
     """
     probability: Plane = 1 - np.exp(-1 / np.maximum(sigma_px, np.float32(1e-6)))
     return np.rint(probability * 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""The use case: open a stream, step it frame by frame, close it."""
+"""The engine: open a stream, step it frame by frame, close it."""
 
 import asyncio
 from collections.abc import Callable, Mapping
@@ -23,12 +23,12 @@ from vergence_proto.types import (
     Timings,
 )
 from vergence_service.inference.batcher import StepBatcher
-from vergence_service.inference.model import RecurrentState, Step, View, state_bytes
+from vergence_service.inference.model import RecurrentState, Step, StereoView, state_bytes
 from vergence_service.metrics import Metrics
 from vergence_service.streams.continuity import ContinuityLimits
-from vergence_service.streams.conversion import Answer, view_of
+from vergence_service.streams.conversion import SteppedFrame, view_from_frame
 from vergence_service.streams.rectify import Rectifier
-from vergence_service.streams.stream import Attachment, Notice, NoticeKind, Opening, Stream
+from vergence_service.streams.stream import Attachment, Notice, NoticeKind, Stream, StreamConfig
 from vergence_service.streams.table import StreamTable
 
 
@@ -39,7 +39,10 @@ class _Phase(Enum):
 
 
 class DepthEngine:
-    """Everything a transport may ask for. It knows no wire, and raises only DepthError."""
+    """Everything that a transport may ask for. It knows no wire format and raises only DepthError.
+
+    Frames of one stream are stepped one at a time, in the order in which they arrive.
+    """
 
     def __init__(
         self,
@@ -67,17 +70,17 @@ class DepthEngine:
 
     @property
     def ready(self) -> bool:
-        """New streams are taken."""
+        """True while new streams are accepted."""
         return self._phase is _Phase.SERVING
 
     async def start(self) -> None:
-        """Load the model; until it is done every opening is refused with NotReady."""
+        """Load the model. Until this is done, opening a stream raises NotReady."""
         counts = (self._iterations, *self._cold_iterations.values())
         await self._batcher.warm_up(*map(self.card.iterations_at_most, counts))
         self._phase = _Phase.SERVING
 
     def drain(self, *, within_s: float) -> None:
-        """Take no new stream, and tell those that are attached."""
+        """Accept no new streams, and notify the clients that are attached."""
         self._phase = _Phase.DRAINING
         notice = Notice(NoticeKind.DRAINING, "the server is shutting down", within_s)
         for attachment in self.streams.attachments():
@@ -86,22 +89,23 @@ class DepthEngine:
     async def open(
         self,
         stream_id: str,
-        opening: Opening,
+        config: StreamConfig,
         *,
         attachment: Attachment | None = None,
         client: str = "",
     ) -> Stream:
-        """A new stream, which counts to the share of ``client``, an address.
+        """Open a stream. It counts towards the limit of ``client``, an address.
 
-        Raises NotReady, Draining, ModelChanged, BadCalibration, FrameTooLarge, and as
-        StreamTable.open.
+        Raises NotReady or Draining if no streams are accepted, ModelChanged, BadCalibration or
+        FrameTooLarge if the configuration cannot be served, BadShape if the id is not allowed,
+        StreamExists if it is in use, and Quota, StreamLimit or StateMemory if a limit is reached.
         """
-        self._check_model(opening)
-        rectifier = await self._rectifier(opening.rig)
+        self._check_model(config)
+        rectifier = await self._rectifier(config.rig)
         reserve = state_bytes(self.card, rectifier.rig.height, rectifier.rig.width)
         return self.streams.open(
             stream_id,
-            opening,
+            config,
             rectifier,
             state_bytes=reserve,
             attachment=attachment,
@@ -112,21 +116,23 @@ class DepthEngine:
         self,
         stream_id: str,
         resume_token: bytes,
-        opening: Opening,
+        config: StreamConfig,
         *,
         attachment: Attachment,
         client: str = "",
     ) -> Stream:
-        """Attach to a stream that is open.
+        """Attach a new connection to an open stream.
 
-        Raises NotReady, Draining, ModelChanged, and as StreamTable.attach.
+        Raises NotReady or Draining if no streams are accepted, ModelChanged if the server runs
+        other weights, UnknownStream or StreamExpired if the stream is gone, StreamExists if the
+        token is wrong, and BadCalibration if the rig is another one.
         """
         self._check_serving()
-        # Before the stream is looked for: a server that restarted has forgotten it, but that its
-        # successor would be another network's is what the client must hear.
-        self._check_model(opening)
+        # Check the model before the stream. A server that restarted does not know the stream any
+        # more, but the client must learn that a new stream would run on another network.
+        self._check_model(config)
         return self.streams.attach(
-            stream_id, resume_token, opening, attachment=attachment, client=client
+            stream_id, resume_token, config, attachment=attachment, client=client
         )
 
     async def step(
@@ -136,78 +142,69 @@ class DepthEngine:
         *,
         arrived_s: float,
         max_age_s: float | None = None,
-    ) -> Answer:
-        """Advance one stream by one frame; a step that failed has left the stream as it was.
+    ) -> SteppedFrame:
+        """Advance one stream by one frame. A step that fails leaves the stream unchanged.
 
-        ``decode`` runs in a worker thread when the frame's turn has come, so a frame that is
-        displaced before is never decoded. Of the answer the caller makes the map, together with
-        what is sent of it. Raises what ``decode`` raises, UnknownStream, StreamExpired,
-        BadShape, FrameOutOfOrder, FrameStale, ModelFailed; and NonFinite, after which the
-        stream starts anew.
+        ``decode`` runs in a worker thread when it is the frame's turn, so a frame that is displaced
+        before that is never decoded. The caller makes the disparity map from the stepped frame, in
+        the thread that also encodes it.
+
+        Raises what ``decode`` raises; UnknownStream or StreamExpired if the stream is gone;
+        BadShape, FrameOutOfOrder or FrameStale if the frame is refused; ModelFailed; Draining; and
+        NonFinite, after which the stream starts again without a state.
         """
         stream = self.streams.get(stream_id)
         self.streams.touch(stream)
         return await self._step(stream, decode, arrived_s=arrived_s, max_age_s=max_age_s)
 
-    async def open_apart(self, opening: Opening, *, state: RecurrentState | None = None) -> Stream:
-        """A stream that nobody attaches to, for a sequence that is known from its first frame on.
+    async def open_offline(
+        self, config: StreamConfig, *, state: RecurrentState | None = None
+    ) -> Stream:
+        """Open a stream without a client, for a sequence whose frames are all known.
 
-        It is in no table: it takes no place from live streams, and ends with its last reference.
-        ``state`` is what the frames before have left. Raises NotReady, Draining, BadCalibration,
-        FrameTooLarge.
+        The stream is not in the table: it takes no place from live streams, and ends with its last
+        reference. It continues from ``state``, the state after earlier frames.
+
+        Raises NotReady or Draining if no streams are accepted, BadCalibration if the rig cannot be
+        rectified, and FrameTooLarge if its images are too large.
         """
-        rectifier = await self._rectifier(opening.rig)
+        rectifier = await self._rectifier(config.rig)
         origin = Origin.COLD_START if state is None else Origin.WARM
         return Stream(
-            "", "", b"", opening, rectifier, 0, None, self._clock(), state=state, origin=origin
+            "", "", b"", config, rectifier, 0, None, self._clock(), state=state, origin=origin
         )
 
-    async def step_apart(
+    async def step_offline(
         self, stream: Stream, decode: Callable[[], StereoFrame]
     ) -> tuple[DisparityMap, RecurrentState]:
-        """As :meth:`step`, of a stream that :meth:`open_apart` made: the map, the state left."""
-        answer = await self._step(stream, decode, arrived_s=self._clock(), max_age_s=None)
-        return await asyncio.to_thread(answer.disparity_map), answer.timed.result.state
+        """Advance a stream of :meth:`open_offline`; return the map and the state after the frame.
 
-    async def _step(
-        self,
-        stream: Stream,
-        decode: Callable[[], StereoFrame],
-        *,
-        arrived_s: float,
-        max_age_s: float | None,
-    ) -> Answer:
-        # The lock wakes its waiters in order, so a stream takes its frames one at a time as they
-        # arrived, and no batch ever holds two frames of one stream.
-        async with stream.turn:
-            try:
-                return await self._advance(stream, decode, arrived_s, max_age_s)
-            except DepthError as error:
-                self.count_failed(stream, error)
-                if isinstance(error, NonFinite):
-                    stream.forget(Origin.RESET_NON_FINITE)
-                raise
+        Raises what ``decode`` raises, BadShape or FrameOutOfOrder if the frame is refused,
+        ModelFailed, NonFinite and Draining.
+        """
+        stepped = await self._step(stream, decode, arrived_s=self._clock(), max_age_s=None)
+        return await asyncio.to_thread(stepped.disparity_map), stepped.result.state
 
     async def reset(self, stream_id: str) -> None:
-        """Frames after it start from nothing. Raises UnknownStream, StreamExpired."""
+        """Let later frames start without a state. Raises UnknownStream, StreamExpired."""
         stream = self.streams.get(stream_id)
         async with stream.turn:
             stream.forget(Origin.RESET_REQUESTED)
 
     def count_dropped(self, stream: Stream) -> None:
-        """A frame of the stream was displaced by a newer one."""
+        """Count a frame that a newer frame displaced."""
         stream.frames_dropped += 1
         stream.frames_skipped += 1
         self.metrics.frames_dropped.inc()
 
     def count_failed(self, stream: Stream, error: DepthError) -> None:
-        """A frame of the stream was answered with an error."""
+        """Count a frame that was answered with an error."""
         stream.frames_failed += 1
         stream.frames_skipped += 1
         self.metrics.frames_failed.labels(error.code).inc()
 
     def close(self, stream_id: str) -> None:
-        """End a stream and free its state, whichever connection asks.
+        """End a stream and free its state; any connection may ask for it.
 
         Raises UnknownStream, StreamExpired.
         """
@@ -223,12 +220,12 @@ class DepthEngine:
             case _Phase.DRAINING:
                 raise Draining("the server is shutting down; try another one")
 
-    def _check_model(self, opening: Opening) -> None:
-        if opening.weights_sha256 not in ("", self.card.weights_sha256):
+    def _check_model(self, config: StreamConfig) -> None:
+        if config.weights_sha256 not in ("", self.card.weights_sha256):
             raise ModelChanged(
-                f"expected a server with weights {opening.weights_sha256[:12]}, this one runs "
-                f"{self.card.name} with {self.card.weights_sha256[:12]}; open a new stream to go "
-                "on with those"
+                f"expected a server with weights {config.weights_sha256[:12]}, this one runs "
+                f"{self.card.name} with {self.card.weights_sha256[:12]}; open a new stream to "
+                "continue with these"
             )
 
     async def _rectifier(self, rig: StereoRig) -> Rectifier:
@@ -236,49 +233,60 @@ class DepthEngine:
         width, height = rig.left.width, rig.left.height
         if width * height > self.max_pixels:
             raise FrameTooLarge(
-                f"expected at most {self.max_pixels} pixels an image, got {width}x{height}"
+                f"expected at most {self.max_pixels} pixels per image, got {width}x{height}"
             )
         return await asyncio.to_thread(Rectifier.of, rig)
 
-    async def _advance(
+    async def _step(
         self,
         stream: Stream,
         decode: Callable[[], StereoFrame],
+        *,
         arrived_s: float,
         max_age_s: float | None,
-    ) -> Answer:
-        started_s = self._clock()
-        skipped = stream.frames_skipped
-        frame, view = await asyncio.to_thread(_decoded_view, decode, stream)
-        decode_s = self._clock() - started_s
-        stream.check_order(frame.frame_id)
-        state, origin = stream.state_before(view, self._limits)
-        iterations = self._iterations_of(stream.opening, cold=state is None)
-        timed = await self._batcher.step(
-            Step(view, state, iterations),
-            deadline_s=None if max_age_s is None else arrived_s + max_age_s,
-            live_stream=stream.stream_id if stream.opening.delivery is Delivery.NEWEST else None,
-        )
-        stream.commit(frame.frame_id, timed.result.state, frames_skipped=skipped)
+    ) -> SteppedFrame:
+        # The lock wakes its waiters in order. So a stream takes its frames one at a time as they
+        # arrived, and no batch ever holds two frames of one stream.
+        async with stream.turn:
+            try:
+                started_s = self._clock()
+                skipped = stream.frames_skipped
+                frame, view = await asyncio.to_thread(_decoded_view, decode, stream)
+                decode_s = self._clock() - started_s
+                stream.check_order(frame.frame_id)
+                state, origin = stream.state_before(view, self._limits)
+                iterations = self._iterations_of(stream.config, cold=state is None)
+                live = stream.config.delivery is Delivery.NEWEST
+                result, timings = await self._batcher.step(
+                    Step(view, state, iterations),
+                    timings=Timings(decode_s=decode_s, queue_s=started_s - arrived_s),
+                    deadline_s=None if max_age_s is None else arrived_s + max_age_s,
+                    live_stream=stream.stream_id if live else None,
+                )
+            except DepthError as error:
+                self.count_failed(stream, error)
+                if isinstance(error, NonFinite):
+                    stream.forget(Origin.RESET_NON_FINITE)
+                raise
+            stream.commit(frame.frame_id, result.state, frames_skipped=skipped)
         self.metrics.frames_stepped.labels(origin.name.lower()).inc()
-        timings = Timings(
-            decode_s=decode_s,
-            queue_s=started_s - arrived_s + timed.queue_s,
-            model_s=timed.model_s,
-        )
         for stage in ("decode", "queue", "model"):
             self.metrics.stage_s.labels(stage).observe(getattr(timings, f"{stage}_s"))
-        return Answer(stream, frame.frame_id, view, timed, origin, iterations, skipped, timings)
+        return SteppedFrame(
+            stream, frame.frame_id, arrived_s, view, result, origin, iterations, skipped, timings
+        )
 
-    def _iterations_of(self, opening: Opening, *, cold: bool) -> int:
+    def _iterations_of(self, config: StreamConfig, *, cold: bool) -> int:
         wanted = (
-            opening.cold_iterations or self._cold_iterations[opening.delivery]
+            config.cold_iterations or self._cold_iterations[config.delivery]
             if cold
-            else opening.iterations or self._iterations
+            else config.iterations or self._iterations
         )
         return self.card.iterations_at_most(wanted)
 
 
-def _decoded_view(decode: Callable[[], StereoFrame], stream: Stream) -> tuple[StereoFrame, View]:
+def _decoded_view(
+    decode: Callable[[], StereoFrame], stream: Stream
+) -> tuple[StereoFrame, StereoView]:
     frame = decode()
-    return frame, view_of(frame, stream.rectifier, stream.opening.axes)
+    return frame, view_from_frame(frame, stream.rectifier, stream.config.axes)

@@ -1,4 +1,4 @@
-"""Rectification of a rig as it is, with maps that are made once per stream."""
+"""Rectify the images of any rig, with maps that are made once per stream."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -14,7 +14,7 @@ from vergence_proto.types import Distortion, Image, Intrinsics, StereoRig
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Maps:
-    """Where each rectified pixel is in the image as taken, in OpenCV's fixed-point form."""
+    """The position of each rectified pixel in the original image, in OpenCV's fixed-point form."""
 
     whole: NDArray[np.int16]  # [H, W, 2]
     fraction: NDArray[np.uint16]  # [H, W]
@@ -26,18 +26,19 @@ class _Maps:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rectifier:
-    """Takes images of a rig to those of its rectification."""
+    """Rectifies the images of one rig."""
 
     rig: RectifiedRig
-    left_from_rectified: Pose  # a rotation: the rectified left camera keeps its centre
-    maps: tuple[_Maps, _Maps] | None = None  # None: the rig is rectified already
-    seen: NDArray[np.bool_] | None = None  # [H, W], rectified left pixels that the camera saw
+    left_from_rectified: Pose  # a rotation: both left cameras have one centre
+    maps: tuple[_Maps, _Maps] | None = None  # None: the rig is already rectified
+    seen: NDArray[np.bool_] | None = None  # [H, W]: the left camera saw this rectified pixel
 
     @classmethod
     def of(cls, rig: StereoRig) -> Self:
-        """Make the maps, if the rig needs any.
+        """Make a rectifier, with maps if the rig needs them.
 
-        Raises BadCalibration: the right camera is not to the right, or no view is in common.
+        Raises BadCalibration if the right camera is not on the right, or if the cameras have no
+        view in common.
         """
         rectified = rig.as_rectified()
         return cls(rectified, Pose.identity()) if rectified else cls._from_cameras(rig)

@@ -1,4 +1,4 @@
-"""A stream: what one client's sequence of frames needs to be remembered."""
+"""A stream: the configuration and the recurrent state of one client's sequence of frames."""
 
 import asyncio
 from dataclasses import dataclass, field
@@ -8,7 +8,7 @@ from typing import Protocol
 from vergence_proto.errors import DepthError, FrameOutOfOrder
 from vergence_proto.geometry import Axes
 from vergence_proto.types import Delivery, Origin, OutputFormat, StereoRig
-from vergence_service.inference.model import RecurrentState, View
+from vergence_service.inference.model import RecurrentState, StereoView
 from vergence_service.streams.continuity import ContinuityLimits, break_between
 from vergence_service.streams.rectify import Rectifier
 
@@ -20,84 +20,87 @@ class NoticeKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """Something that will happen to a stream, told before it does."""
+    """An announcement of something that will soon happen to a stream."""
 
     kind: NoticeKind
     message: str
-    in_s: float
+    in_s: float  # time until it happens
 
 
 class Attachment(Protocol):
-    """The connection that has a stream. Neither method may block or raise."""
+    """The connection that uses a stream. Its methods must neither block nor raise."""
 
-    def notify(self, notice: Notice) -> None: ...
+    def notify(self, notice: Notice) -> None:
+        """Send the notice to the client."""
+        ...
 
     def end(self, error: DepthError) -> None:
-        """The stream is no longer this connection's."""
+        """End the connection with ``error``: the stream does not belong to it any more."""
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Opening:
-    """How a client wants its stream."""
+class StreamConfig:
+    """The client's choices for a stream."""
 
     rig: StereoRig
     axes: Axes = Axes.OPENCV
     delivery: Delivery = Delivery.NEWEST
     output: OutputFormat = field(default_factory=OutputFormat)
-    iterations: int = 0  # of a warm step; 0: the server's default
-    cold_iterations: int = 0
-    weights_sha256: str = ""  # that all results must come from; empty: whatever the server runs
+    iterations: int = 0  # iterations of a warm step; 0: the server's default
+    cold_iterations: int = 0  # iterations of a cold step; 0: the server's default
+    weights_sha256: str = ""  # weights that the server must run; empty: any weights
 
 
 @dataclass(slots=True, eq=False)
 class Stream:
-    """One client's sequence: its rig, its recurrent state, its place in the order of frames."""
+    """One client's sequence: its rig, its recurrent state and the order of its frames."""
 
     stream_id: str
-    client: str  # whose share it counts to; empty: nobody's
+    client: str  # address whose limit the stream counts towards; empty: none
     resume_token: bytes
-    opening: Opening
+    config: StreamConfig
     rectifier: Rectifier
-    state_bytes: int  # reserved for it
+    state_bytes: int  # memory reserved for the state
     attachment: Attachment | None
-    active_s: float  # when it last had a frame, or was attached or detached
+    active_s: float  # time of the last frame, attachment or detachment
     state: RecurrentState | None = None
-    origin: Origin = Origin.COLD_START  # of the next step, unless its view breaks continuity
-    last_frame_id: int = 0  # the last one stepped
+    origin: Origin = Origin.COLD_START  # origin of the next step, if its view continues the state
+    last_frame_id: int = 0  # last frame that was stepped
     frames_stepped: int = 0
     frames_dropped: int = 0
     frames_failed: int = 0
-    frames_skipped: int = 0  # not stepped since the last one that was
-    warned: bool = False  # of its expiry
+    frames_skipped: int = 0  # frames dropped or failed since the last stepped frame
+    warned: bool = False  # the client knows that the stream will expire
     turn: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     def check_order(self, frame_id: int) -> None:
+        """Raise FrameOutOfOrder unless the frame is newer than the last stepped one."""
         if frame_id <= self.last_frame_id:
             raise FrameOutOfOrder(
-                f"expected a frame_id above {self.last_frame_id}, the last one stepped, "
+                f"expected a frame_id above {self.last_frame_id}, the last stepped frame, "
                 f"got {frame_id}"
             )
 
     def state_before(
-        self, view: View, limits: ContinuityLimits
+        self, view: StereoView, limits: ContinuityLimits
     ) -> tuple[RecurrentState | None, Origin]:
-        """The state that ``view`` is stepped on, None for a cold start, and why."""
+        """Return the state to step ``view`` from, None for a cold start, and the reason."""
         if self.state is None:
             return None, self.origin
         broken = break_between(self.state, view, limits)
         return (None, broken) if broken else (self.state, self.origin)
 
     def commit(self, frame_id: int, state: RecurrentState, *, frames_skipped: int) -> None:
-        """Frame ``frame_id`` was stepped, ``frames_skipped`` after the one before it."""
+        """Record that ``frame_id`` was stepped, ``frames_skipped`` frames after the one before."""
         self.state = state
         self.origin = Origin.WARM
         self.last_frame_id = frame_id
         self.frames_stepped += 1
-        # Those that were dropped while this one was in the model belong to the next.
+        # Frames that were dropped while this one was in the model count for the next.
         self.frames_skipped -= frames_skipped
 
     def forget(self, reason: Origin) -> None:
-        """The next step starts from nothing."""
+        """Discard the state; the next step is cold."""
         self.state = None
         self.origin = reason

@@ -1,4 +1,4 @@
-"""The open streams: who has them, within which limits, and when they end."""
+"""The table of open streams: their owners, limits and expiry."""
 
 import hmac
 import secrets
@@ -19,14 +19,14 @@ from vergence_proto.errors import (
 from vergence_proto.types import Origin, StereoRig, checked_stream_id
 from vergence_service.metrics import Metrics
 from vergence_service.streams.rectify import Rectifier
-from vergence_service.streams.stream import Attachment, Notice, NoticeKind, Opening, Stream
+from vergence_service.streams.stream import Attachment, Notice, NoticeKind, Stream, StreamConfig
 
-# How long an expired stream is told apart from one that never was.
+# The server remembers for this long that a stream expired, and reports it as such.
 _TOMBSTONE_S = 300.0
 
 
 class StreamTable:
-    """All streams of one server, within its limits. Time comes from ``clock``, in seconds."""
+    """All streams of one server, within its limits. ``clock`` returns seconds."""
 
     def __init__(
         self,
@@ -60,16 +60,17 @@ class StreamTable:
     def open(
         self,
         stream_id: str,
-        opening: Opening,
+        config: StreamConfig,
         rectifier: Rectifier,
         *,
         state_bytes: int,
         attachment: Attachment | None,
         client: str,
     ) -> Stream:
-        """Make a new stream; an empty id lets the server choose one.
+        """Open a stream. If the id is empty, the server chooses one.
 
-        Raises BadShape (the id), StreamExists, Quota, StreamLimit, StateMemory.
+        Raises BadShape if the id is not allowed, StreamExists if it is in use, and Quota,
+        StreamLimit or StateMemory if a limit is reached.
         """
         self.sweep()
         stream_id = stream_id or f"s-{secrets.token_hex(8)}"
@@ -82,21 +83,21 @@ class StreamTable:
         theirs = [each for each in self._streams.values() if client and each.client == client]
         if self._per_client is not None and len(theirs) >= self._per_client:
             raise Quota(
-                f"{client} holds {len(theirs)} streams, as many as one client may; close one, or "
+                f"{client} has {len(theirs)} open streams, the limit per client; close one, or "
                 "try again later",
                 retry_after_s=self._next_expiry_s(theirs),
             )
         if len(self._streams) >= self.capacity:
             raise StreamLimit(
-                f"the server holds {self.capacity} streams, as many as it may; close one, or "
+                f"the server has {self.capacity} open streams, its limit; close one, or "
                 "try again later",
                 retry_after_s=self._next_expiry_s(self._streams.values()),
             )
         reserved = self._reserved_bytes()
         if reserved + state_bytes > self._max_state_bytes:
             raise StateMemory(
-                f"the stream's state takes {state_bytes} bytes; {reserved} of "
-                f"{self._max_state_bytes} are taken",
+                f"the stream's state needs {state_bytes} bytes; {reserved} of "
+                f"{self._max_state_bytes} are in use; close a stream, or try again later",
                 retry_after_s=self._next_expiry_s(self._streams.values()),
             )
         self._expired_s.pop(stream_id, None)
@@ -104,7 +105,7 @@ class StreamTable:
             stream_id,
             client,
             secrets.token_bytes(16),
-            opening,
+            config,
             rectifier,
             state_bytes,
             attachment,
@@ -118,20 +119,20 @@ class StreamTable:
         self,
         stream_id: str,
         resume_token: bytes,
-        opening: Opening,
+        config: StreamConfig,
         *,
         attachment: Attachment,
         client: str,
     ) -> Stream:
-        """Give an open stream to a new connection; the newest attachment wins.
+        """Attach a new connection to an open stream; the newest connection wins.
 
-        Raises UnknownStream, StreamExpired, StreamExists (the token is not this stream's) and
-        BadCalibration (the rig is not the one it was opened with).
+        Raises UnknownStream or StreamExpired if the stream is gone, StreamExists if the token
+        belongs to another stream, and BadCalibration if the rig has changed.
         """
         stream = self.get(stream_id)
         if not hmac.compare_digest(resume_token, stream.resume_token):
-            raise StreamExists(f"stream {stream_id!r} is open and the resume token is not its own")
-        if not _same_rig(stream.opening.rig, opening.rig):
+            raise StreamExists(f"stream {stream_id!r} is open, and the resume token is wrong")
+        if not _same_rig(stream.config.rig, config.rig):
             raise BadCalibration(
                 f"stream {stream_id!r} was opened with another rig; open a new stream for this one"
             )
@@ -139,22 +140,25 @@ class StreamTable:
             stream.attachment.end(
                 Superseded(f"a newer connection attached to stream {stream_id!r}")
             )
-        stream.opening = opening
+        stream.config = config
         stream.attachment = attachment
-        stream.client = client  # which may have come back by another network
+        stream.client = client  # the client may have changed its network
         if stream.state is not None:
             stream.origin = Origin.RESUMED
         self.touch(stream)
         return stream
 
     def detach(self, stream: Stream, attachment: Attachment) -> None:
-        """A connection is gone; its stream waits for the next one, if it was still its own."""
+        """Detach a connection that is gone; its stream waits for the next connection."""
         if stream.attachment is attachment:
             stream.attachment = None
             self.touch(stream)
 
     def get(self, stream_id: str) -> Stream:
-        """Raises UnknownStream, or StreamExpired if it was open in the last five minutes."""
+        """Return an open stream.
+
+        Raises StreamExpired if it expired in the last five minutes, otherwise UnknownStream.
+        """
         stream = self._streams.get(stream_id)
         if stream is not None and self._clock() >= self._expiry_s(stream):
             self._expire(stream)
@@ -162,24 +166,24 @@ class StreamTable:
             return stream
         if stream_id in self._expired_s:
             raise StreamExpired(
-                f"stream {stream_id!r} was left without a connection for {self.detach_grace_s:g} s "
+                f"stream {stream_id!r} had no connection for {self.detach_grace_s:g} s "
                 f"or without a frame for {self.idle_timeout_s:g} s; open it again"
             )
         raise UnknownStream(f"no open stream {stream_id!r}; open it before sending frames")
 
     def touch(self, stream: Stream) -> None:
-        """The stream is in use: it will not expire for another while."""
+        """Record that the stream is in use: its time until expiry starts again."""
         stream.active_s = self._clock()
         stream.warned = False
 
     def close(self, stream: Stream) -> None:
-        """End a stream and free its state, from whichever connection."""
+        """End a stream and free its state."""
         if self._streams.get(stream.stream_id) is stream:
             del self._streams[stream.stream_id]
             self._count()
 
     def sweep(self) -> None:
-        """Expire what is due, and warn what will be soon."""
+        """Expire the streams that are due, and warn those that will be soon."""
         now_s = self._clock()
         for stream in list(self._streams.values()):
             left_s = self._expiry_s(stream) - now_s
@@ -194,6 +198,7 @@ class StreamTable:
                 del self._expired_s[stream_id]
 
     def idle_s(self, stream: Stream) -> float:
+        """Return the time since the stream was last in use."""
         return self._clock() - stream.active_s
 
     def _expire(self, stream: Stream) -> None:

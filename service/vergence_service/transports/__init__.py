@@ -1,1 +1,5 @@
-"""Transports translate, and nothing else: bytes to values, errors to statuses, calls to calls."""
+"""Transports translate bytes to values, errors to statuses and calls to calls; they decide nothing.
+
+Read ``stream_call`` first (one StreamDepth call, for every transport), then ``mailbox``, ``outbox``
+and ``open_calls``, then one of ``grpc``, ``http`` and ``zenoh``.
+"""

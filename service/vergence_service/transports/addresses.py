@@ -1,6 +1,6 @@
-"""Addresses as people write them."""
+"""Network addresses as text."""
 
 
-def place(host: str, port: int) -> str:
-    """HOST:PORT, with an IPv6 address in brackets."""
+def format_address(host: str, port: int) -> str:
+    """Return HOST:PORT, with an IPv6 address in brackets."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

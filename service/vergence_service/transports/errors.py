@@ -1,29 +1,27 @@
-"""What keeps a transport from starting: errors for the operator, in one sentence each."""
+"""Errors that keep a transport from starting, each one sentence for the operator."""
 
 
 class PortTaken(OSError):
-    """An address cannot be listened on."""
+    """The server cannot listen on an address."""
 
     def __init__(self, address: str, setting: str) -> None:
         super().__init__(
-            f"cannot listen on {address}: another server has the port, or the address is not this "
-            f"machine's; choose another with {setting}"
+            f"cannot listen on {address}: another server uses the port, or the address does not "
+            f"belong to this machine; choose another with {setting}"
         )
 
 
 class ExtraMissing(ImportError):
-    """A setting asks for what is not installed here."""
+    """A setting needs a package that is not installed."""
 
     def __init__(self, what: str, extra: str) -> None:
-        super().__init__(
-            f"{what} is not installed here; install it: pip install 'vergence[{extra}]'"
-        )
+        super().__init__(f"{what} is not installed; install it: pip install 'vergence[{extra}]'")
 
 
 class ZenohUnreachable(OSError):
-    """The Zenoh network cannot be joined as the settings say."""
+    """The server cannot join the Zenoh network that the settings name."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(
-            f"cannot start Zenoh: {reason}; look at zenoh.listen, zenoh.connect and zenoh.config"
+            f"cannot start Zenoh: {reason}; check zenoh.listen, zenoh.connect and zenoh.config"
         )

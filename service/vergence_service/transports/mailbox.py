@@ -1,77 +1,78 @@
-"""Where the frames of one connection wait, undecoded, for their turn."""
+"""The frames of one connection that wait, not decoded yet, for their step."""
 
 import asyncio
 from collections import deque
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
 
 from vergence_proto.errors import FrameOutOfOrder
 from vergence_proto.types import Delivery
-
-Content = TypeVar("Content")
+from vergence_proto.v1 import depth_pb2 as pb
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Letter(Generic[Content]):
+class QueuedFrame:
     """A frame as it arrived."""
 
-    frame_id: int
-    content: Content
+    frame: pb.Frame
     arrived_s: float
-    reset_before: bool = False  # the client asked for it between the frame before and this one
+    reset_before: bool = False  # the client asked for a reset just before this frame
+
+    @property
+    def frame_id(self) -> int:
+        return self.frame.frame_id
 
 
-class Mailbox(Generic[Content]):
-    """One reader puts, one stepper takes.
+class Mailbox:
+    """A queue of frames between one reader, which puts, and one stepper, which takes.
 
-    NEWEST holds one letter, which a newer one displaces, so what is taken is never old. EVERY
-    holds ``capacity`` and then lets the reader wait, which in turn lets the sender wait.
+    NEWEST holds one frame, and a newer frame displaces it, so the stepper never takes an old frame.
+    EVERY holds ``capacity`` frames; then the reader waits, and so does the sender.
     """
 
     def __init__(self, delivery: Delivery, *, capacity: int) -> None:
         self._displaces = delivery is Delivery.NEWEST
         self._capacity = 1 if self._displaces else capacity
-        self._letters: deque[Letter[Content]] = deque()
+        self._frames: deque[QueuedFrame] = deque()
         self._reset_asked = False
         self._finished = False
         self._changed = asyncio.Condition()
 
-    async def put(self, letter: Letter[Content]) -> Letter[Content] | None:
-        """Add a letter; the one that it displaced, if any.
+    async def put(self, queued: QueuedFrame) -> QueuedFrame | None:
+        """Add a frame; return the frame that it displaced, if any.
 
-        Raises FrameOutOfOrder: an older frame must not displace a newer one.
+        Raises FrameOutOfOrder, because an older frame must not displace a newer one.
         """
         async with self._changed:
-            if self._letters and letter.frame_id <= self._letters[-1].frame_id:
+            if self._frames and queued.frame_id <= self._frames[-1].frame_id:
                 raise FrameOutOfOrder(
-                    f"expected a frame_id above {self._letters[-1].frame_id}, which is waiting, "
-                    f"got {letter.frame_id}"
+                    f"expected a frame_id above {self._frames[-1].frame_id}, which is waiting, "
+                    f"got {queued.frame_id}"
                 )
-            displaced: Letter[Content] | None = None
-            if self._displaces and self._letters:
-                displaced = self._letters.popleft()
-            await self._changed.wait_for(lambda: len(self._letters) < self._capacity)
-            # A reset that was asked for before a displaced frame is still owed to the next one.
-            owed = self._reset_asked or (displaced is not None and displaced.reset_before)
-            self._letters.append(replace(letter, reset_before=owed))
+            displaced: QueuedFrame | None = None
+            if self._displaces and self._frames:
+                displaced = self._frames.popleft()
+            await self._changed.wait_for(lambda: len(self._frames) < self._capacity)
+            # A reset before a displaced frame still applies to the next frame.
+            reset_before = self._reset_asked or (displaced is not None and displaced.reset_before)
+            self._frames.append(replace(queued, reset_before=reset_before))
             self._reset_asked = False
             self._changed.notify_all()
             return displaced
 
     def reset(self) -> None:
-        """The next letter put is to start from nothing."""
+        """Mark the next frame: the stream starts again without a state before it."""
         self._reset_asked = True
 
     async def finish(self) -> None:
-        """No letter follows; those that wait can still be taken."""
+        """Accept no more frames; waiting frames can still be taken."""
         async with self._changed:
             self._finished = True
             self._changed.notify_all()
 
-    async def take(self) -> Letter[Content] | None:
-        """The oldest letter, waiting for one; None when there will be no more."""
+    async def take(self) -> QueuedFrame | None:
+        """Wait for the oldest frame and return it, or None if no more frames come."""
         async with self._changed:
-            await self._changed.wait_for(lambda: bool(self._letters) or self._finished)
-            letter = self._letters.popleft() if self._letters else None
+            await self._changed.wait_for(lambda: bool(self._frames) or self._finished)
+            queued = self._frames.popleft() if self._frames else None
             self._changed.notify_all()
-            return letter
+            return queued

@@ -10,7 +10,7 @@ from vergence_service.transports.stream_call import DepthCall, StreamLimits
 
 
 class OpenCalls:
-    """Makes calls, knows those that run, and ends them when the server drains."""
+    """Makes calls, keeps track of those that run, and ends them when the server drains."""
 
     def __init__(
         self, engine: DepthEngine, *, limits: StreamLimits, clock: Callable[[], float]
@@ -29,7 +29,7 @@ class OpenCalls:
         *,
         client: str,
     ) -> DepthCall:
-        """``client`` is the address that the call comes from; empty where nobody knows."""
+        """Make a call. ``client`` is the address it comes from, or empty if that is unknown."""
         return DepthCall(
             self._engine,
             requests,
@@ -51,7 +51,7 @@ class OpenCalls:
                 self._idle.set()
 
     async def drain(self, *, within_s: float) -> None:
-        """Let calls end by themselves; after that, answer what they have sent and end them."""
+        """Wait until all calls end; after ``within_s``, answer what they have sent and end them."""
         try:
             async with asyncio.timeout(within_s):
                 await self._idle.wait()

@@ -1,4 +1,4 @@
-"""One StreamDepth call, whatever carries it: a reader, a stepper and a sender, so they overlap."""
+"""One StreamDepth call, on any transport: a reader, a stepper and a sender that overlap."""
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
@@ -9,16 +9,18 @@ from vergence_proto import codec
 from vergence_proto.errors import BadShape, DepthError, StreamExists, UnknownStream
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.streams.engine import DepthEngine
-from vergence_service.streams.stream import Notice, Opening, Stream
-from vergence_service.transports.mailbox import Letter, Mailbox
+from vergence_service.streams.stream import Notice, Stream, StreamConfig
+from vergence_service.transports.mailbox import Mailbox, QueuedFrame
 from vergence_service.transports.outbox import Outbox
 from vergence_service.transports.unary import model_info
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamLimits:
-    credit: int  # frames that a client may have unanswered
-    waiting_frames: int  # of a lossless stream, before the sender waits
+    """The limits of one call."""
+
+    credit: int  # most frames that a client may send before an answer returns
+    waiting_frames: int  # frames of a lossless stream that wait before the sender must wait
     max_frame_bytes: int
 
 
@@ -45,14 +47,14 @@ class DepthCall:
         self._reader: asyncio.Task[None] | None = None
         self._stepper: asyncio.Task[None] | None = None
         self._stream: Stream | None = None
-        self._error: DepthError | None = None  # what the call ends with
+        self._error: DepthError | None = None  # the error that the call ends with
         self._client_is_done = False
 
     def notify(self, notice: Notice) -> None:
         self._outbox.put_notice(notice)
 
-    async def tell_lost(self, frame_ids: Sequence[int]) -> None:
-        """Count and answer frames that, as the transport knows, were sent and never came."""
+    async def report_lost(self, frame_ids: Sequence[int]) -> None:
+        """Count and answer frames that the client sent and the transport lost."""
         if self._stream is not None and frame_ids:
             await self._drop(self._stream, frame_ids)
 
@@ -63,7 +65,7 @@ class DepthCall:
             self._stepper.cancel()
 
     def finish(self, error: DepthError) -> None:
-        """Stop reading, answer what has arrived, and end with the error."""
+        """Stop reading, answer the frames that have arrived, and end with the error."""
         self._error = self._error or error
         if self._reader is not None:
             self._reader.cancel()
@@ -84,8 +86,7 @@ class DepthCall:
             self._engine.close(stream.stream_id)
 
     async def _serve(self, stream: Stream) -> None:
-        mailbox: Mailbox[pb.Frame]
-        mailbox = Mailbox(stream.opening.delivery, capacity=self._limits.waiting_frames)
+        mailbox = Mailbox(stream.config.delivery, capacity=self._limits.waiting_frames)
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._outbox.send())
             self._reader = tasks.create_task(self._read(stream, mailbox))
@@ -98,7 +99,7 @@ class DepthCall:
         if first is None or not first.HasField("open"):
             raise UnknownStream("the first message of a call must open or resume a stream")
         request = first.open
-        opening = Opening(
+        config = StreamConfig(
             rig=codec.rig_from_proto(request.rig),
             axes=codec.axes_from_proto(request.axes),
             delivery=codec.delivery_from_proto(request.delivery),
@@ -111,13 +112,13 @@ class DepthCall:
             resumed = self._engine.resume(
                 request.stream_id,
                 request.resume_token,
-                opening,
+                config,
                 attachment=self,
                 client=self._client,
             )
             return resumed, True
         opened = await self._engine.open(
-            request.stream_id, opening, attachment=self, client=self._client
+            request.stream_id, config, attachment=self, client=self._client
         )
         return opened, False
 
@@ -134,7 +135,7 @@ class DepthCall:
             last_frame_id=stream.last_frame_id,
         )
 
-    async def _read(self, stream: Stream, mailbox: Mailbox[pb.Frame]) -> None:
+    async def _read(self, stream: Stream, mailbox: Mailbox) -> None:
         try:
             async for request in self._requests:
                 arrived_s = self._clock()
@@ -149,19 +150,19 @@ class DepthCall:
                         self._client_is_done = True
                         return
                     case "open":
-                        self.end(StreamExists("this call has opened its stream already"))
+                        self.end(StreamExists("this call has already opened its stream"))
                     case None:
                         self.end(BadShape("expected one of the messages of depth.proto, got none"))
-        except DepthError as error:  # what came is no message
+        except DepthError as error:  # the bytes are not a message
             self.end(error)
         finally:
             await mailbox.finish()
 
     async def _receive(
-        self, stream: Stream, mailbox: Mailbox[pb.Frame], frame: pb.Frame, arrived_s: float
+        self, stream: Stream, mailbox: Mailbox, frame: pb.Frame, arrived_s: float
     ) -> None:
         try:
-            displaced = await mailbox.put(Letter(frame.frame_id, frame, arrived_s))
+            displaced = await mailbox.put(QueuedFrame(frame, arrived_s))
         except DepthError as error:
             self._engine.count_failed(stream, error)
             await self._refuse(frame.frame_id, error)
@@ -175,18 +176,18 @@ class DepthCall:
         dropped = pb.FramesDropped(frame_ids=frame_ids)
         await self._outbox.put(pb.StreamDepthResponse(frames_dropped=dropped))
 
-    async def _step(self, stream: Stream, mailbox: Mailbox[pb.Frame]) -> None:
+    async def _step(self, stream: Stream, mailbox: Mailbox) -> None:
         rig = stream.rectifier.rig
         while True:
             await self._outbox.reserve_map()
-            letter = await mailbox.take()
-            if letter is None:
+            queued = await mailbox.take()
+            if queued is None:
                 return
-            frame = letter.content
+            frame = queued.frame
             try:
-                if letter.reset_before:
+                if queued.reset_before:
                     await self._engine.reset(stream.stream_id)
-                answer = await self._engine.step(
+                stepped = await self._engine.step(
                     stream.stream_id,
                     partial(
                         codec.frame_from_proto,
@@ -194,14 +195,14 @@ class DepthCall:
                         size=(rig.width, rig.height),
                         max_bytes=self._limits.max_frame_bytes,
                     ),
-                    arrived_s=letter.arrived_s,
+                    arrived_s=queued.arrived_s,
                     max_age_s=frame.max_age_s if frame.HasField("max_age_s") else None,
                 )
             except DepthError as error:
                 self._outbox.release_map()
-                await self._refuse(letter.frame_id, error)
+                await self._refuse(queued.frame_id, error)
             else:
-                await self._outbox.put_map(answer, arrived_s=letter.arrived_s)
+                await self._outbox.put_map(stepped)
 
     async def _refuse(self, frame_id: int, error: DepthError) -> None:
         message = codec.error_to_frame_error(frame_id, error)

@@ -1,4 +1,4 @@
-"""The methods of DepthService that are one question and one answer, whoever carries them."""
+"""The unary methods of DepthService (one request, one answer), on any transport."""
 
 from importlib.metadata import version
 
@@ -10,7 +10,7 @@ from vergence_service.streams.engine import DepthEngine
 
 
 class UnaryMethods:
-    """Translates each question to the engine's words. Raises DepthError."""
+    """Translates each request to a call of the engine. Raises DepthError."""
 
     def __init__(
         self, engine: DepthEngine, *, computed_by: str, provider: str, max_frame_bytes: int

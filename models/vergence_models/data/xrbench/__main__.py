@@ -16,11 +16,11 @@ from vergence_models.data.xrbench.recipe import KINDS, SETS, BadRecipe, Recipe
 from vergence_models.data.xrbench.sheet import contact_sheet
 from vergence_models.data.xrbench.tracer import VARIANTS, NoRenderer
 from vergence_models.data.xrbench.writer import PASSES, encode_png, render_sequence
-from vergence_proto.datasets import LayoutError
+from vergence_proto.datasets import DatasetError
 
 
 def _option(field: str, text: str) -> typer.models.OptionInfo:
-    """Of a field that every chosen recipe takes from the command line, where it is given."""
+    """An option that replaces a field of every chosen recipe."""
     option: typer.models.OptionInfo = typer.Option(
         help=f"{text} The recipe's own ({getattr(Recipe(KINDS[0]), field):g}) if not given."
     )
@@ -52,12 +52,12 @@ def main(
         Path | None, typer.Option(help="A PNG of the last sequence's first frame, all truths.")
     ] = None,
     list_: Annotated[
-        bool, typer.Option("--list", help="Tell what the sets hold, and stop.")
+        bool, typer.Option("--list", help="Print the contents of the sets, and stop.")
     ] = False,
 ) -> None:
     """Path-trace stereo sequences of indoor scenes with every ground truth.
 
-    `--set benchmark --out DIR` renders the whole benchmark; a stopped run goes on where it was.
+    `--set benchmark --out DIR` renders the whole benchmark; a stopped run continues.
     `vergence run sceneflow:DIR/frames_finalpass/NAME` reads a sequence.
     """
     console = Console()
@@ -78,10 +78,10 @@ def main(
         _render(recipes, out, chosen, variant, console)
         if sheet:
             sheet.write_bytes(encode_png(contact_sheet(out, recipes[-1].name, 0)))
-    except (BadRecipe, NoRenderer, LayoutError, OSError) as error:
+    except (BadRecipe, NoRenderer, DatasetError, OSError) as error:
         raise SystemExit(f"error: {error}") from None
     except KeyboardInterrupt:
-        raise SystemExit("stopped; the same command goes on from here") from None
+        raise SystemExit("stopped; the same command continues from here") from None
 
 
 def _chosen(set_: str | None, files: list[Path], room: str | None) -> list[Recipe]:

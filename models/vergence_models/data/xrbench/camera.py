@@ -11,10 +11,17 @@ from numpy.typing import NDArray
 
 from vergence_models.data.xrbench import effects, rooms, truths
 from vergence_models.data.xrbench.denoise import denoised
+from vergence_models.data.xrbench.head_path import HeadPath, right_of
 from vergence_models.data.xrbench.meshes import Matrix
-from vergence_models.data.xrbench.motion import HeadPath, right_of
 from vergence_models.data.xrbench.recipe import Recipe
-from vergence_models.data.xrbench.tracer import Hits, Light, Optics, Planes, Tracer, View
+from vergence_models.data.xrbench.tracer import (
+    CameraView,
+    FirstHits,
+    Optics,
+    Planes,
+    TracedLight,
+    Tracer,
+)
 
 Image = NDArray[np.uint8]  # [H, W, 3], RGB
 
@@ -26,7 +33,7 @@ class Eye(IntEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameTruth:
-    """Of the left view but where it says otherwise; see `truths` for shapes and frames."""
+    """Truth of the left view, unless named otherwise; see `truths` for shapes and frames."""
 
     disparity_px: truths.Plane
     right_disparity_px: truths.Plane
@@ -59,7 +66,7 @@ class StereoCamera:
         return right_of(left, self.recipe.baseline_m) if eye is Eye.RIGHT else left
 
     def clean(self, frame: int, eye: Eye) -> Image:
-        """A pinhole and an instant: nothing but geometry and light."""
+        """The image of a pinhole camera at one instant: geometry and light alone."""
         time_s = self.path.frame_time_s(frame)
         light = self._tracer.light(
             self.optics, self.world_from_eye(time_s, eye), time_s,
@@ -68,7 +75,7 @@ class StereoCamera:
         return self._developed(light, frame, eye)
 
     def final(self, frame: int, eye: Eye) -> Image:
-        """The same moment through a lens, an open shutter and rows read one by one."""
+        """The same moment seen through a lens, with an exposure time and a rolling shutter."""
         recipe = self.recipe
         time_s = self.path.frame_time_s(frame)
         instants = effects.schedule(recipe.effects, recipe.height, self._moved_px(time_s))
@@ -84,7 +91,7 @@ class StereoCamera:
                 self.optics, self.world_from_eye(then_s, eye), then_s, samples=samples,
                 seed=(2 * frame + eye) * len(instants) + index + 1_000_000,
                 flicker=effects.lamp_gain(recipe.effects, then_s),
-                view=View(instant.first_row, rows, instant.lens_m, recipe.effects.focus_m),
+                view=CameraView(instant.first_row, rows, instant.lens_m, recipe.effects.focus_m),
             )  # fmt: skip
             band = np.s_[instant.first_row : instant.first_row + rows]
             opened = instant.open[:, None, None]
@@ -92,7 +99,7 @@ class StereoCamera:
             total[band] += opened * np.concatenate(planes, -1)
             times[band] += opened
         total /= times
-        light = Light(total[..., :3], total[..., 3:6], total[..., 6:9], total[..., 9:])
+        light = TracedLight(total[..., :3], total[..., 3:6], total[..., 6:9], total[..., 9:])
         return self._developed(light, frame, eye, glare=recipe.effects.glare)
 
     def truth(self, frame: int) -> FrameTruth:
@@ -122,11 +129,11 @@ class StereoCamera:
             boxes=truths.boxes(hits, self.room, now_s),
         )
 
-    def _hits(self, frame: int, eye: Eye) -> Hits:
+    def _hits(self, frame: int, eye: Eye) -> FirstHits:
         time_s = self.path.frame_time_s(frame)
         return self._tracer.hits(self.optics, self.world_from_eye(time_s, eye), time_s)
 
-    def _developed(self, light: Light, frame: int, eye: Eye, *, glare: float = 0.0) -> Image:
+    def _developed(self, light: TracedLight, frame: int, eye: Eye, *, glare: float = 0.0) -> Image:
         radiance: Planes = light.radiance
         if self.recipe.denoise:
             # One more pixel around mirrors and glass: outlines are a mixture.
@@ -147,7 +154,7 @@ class StereoCamera:
         return self._gain
 
     def _moved_px(self, time_s: float) -> float:
-        """How far what is a metre away moves in the image while a row is open."""
+        """The motion in the image of a point at one metre while a row is open, in px."""
         half_s = self.recipe.effects.exposure_s / 2
         start, end = (self.path.world_from_left(time_s + dt) for dt in (-half_s, half_s))
         turned = np.linalg.norm(start[:3, :3].T @ end[:3, :3] - np.eye(3)) / np.sqrt(2)

@@ -1,21 +1,21 @@
-"""Fewer light paths by filtering what they disagree on: light, but never texture or outlines."""
+"""Denoising, which allows fewer light paths: it smooths light, never textures or outlines."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vergence_models.data.xrbench.tracer import Light, Planes
+from vergence_models.data.xrbench.tracer import Planes, TracedLight
 
 _LEVELS = 5  # the last one reaches 16 pixels
 _FLOOR = 0.01  # added to the albedo, so that black can be divided by
-_EDGE = 0.35  # neighbours whose light differs by this factor (in logarithm) are told apart
+_EDGE = 0.35  # neighbours whose light differs by this factor (in logarithm) are not mixed
 _LIKENESS = 6  # exponent of the cosine between normals: 0.1 for pixels half on either wall
 _DEPTH = 0.02  # relative step in depth that separates surfaces, a pixel
-_BRIGHTEST = 30.0  # of the median: single paths beyond it are fireflies
+_BRIGHTEST = 30.0  # times the median: brighter single paths are fireflies
 
 
-def denoised(light: Light, keep: NDArray[np.bool_] | None = None) -> Planes:
+def denoised(light: TracedLight, keep: NDArray[np.bool_] | None = None) -> Planes:
     """Linear RGB [H, W, 3]; pixels in `keep` [H, W] (mirrors, glass) stay as they came.
 
     Divides by the albedo, smooths what is left across like normals and depths, multiplies again

@@ -1,7 +1,7 @@
-"""What the final pass's camera does: rows exposed one after the other, glare, the tone curve.
+"""Effects of the final pass's camera: rows exposed one after the other, glare, the tone curve.
 
-Motion blur, rolling shutter, flicker and defocus come from one thing, the schedule of an exposure:
-each instant is rendered as it was, for the rows that are open then, through one point of the lens.
+Motion blur, rolling shutter, flicker and defocus all follow from the schedule of an exposure: each
+instant is rendered for the rows that are open then, through one point of the lens.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from vergence_models.data.xrbench.recipe import Effects
 from vergence_models.data.xrbench.tracer import Planes
 
-_FEWEST_STEPS = 6  # of an exposure: enough for the flicker's wave, and points of the lens
+_FEWEST_STEPS = 6  # instants of an exposure: enough for the flicker's wave and points of the lens
 _STEP_PX = 1.5  # images of one exposure that lie closer than this melt into a streak
 # Scattered light: shares, and how far it gets as a share of the image's width.
 _HALOS = ((0.6, 0.008), (0.4, 0.04))
@@ -33,10 +33,10 @@ class Instant:
 
 
 def schedule(effects: Effects, height: int, moved_px: float) -> list[Instant]:
-    """The instants of one frame; each row is open in as many, to one.
+    """The instants of one frame; any two rows are open in the same number of them, to one.
 
-    `moved_px` is how far things move in the image during the exposure. All bands have as many
-    rows, so that one compiled camera renders them all.
+    `moved_px` is the motion of objects in the image during the exposure. All bands have the same
+    number of rows, so that one compiled camera renders them all.
     """
     # A shorter exposure would need more bands than it is worth; none at all cannot be divided by.
     exposure_s = max(effects.exposure_s, effects.readout_s / 16, 1e-9)
@@ -65,7 +65,7 @@ def _lens_point(index: int, count: int, radius_m: float) -> tuple[float, float]:
 
 
 def lamp_gain(effects: Effects, time_s: float) -> float:
-    """How bright the lamps are at a time, 1 on average."""
+    """The brightness of the lamps at a time, 1 on average."""
     return 1 + effects.flicker * math.sin(2 * math.pi * effects.flicker_hz * time_s)
 
 

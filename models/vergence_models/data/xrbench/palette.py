@@ -1,4 +1,4 @@
-"""Surfaces drawn at random, by what they are for."""
+"""Random surfaces, by their purpose."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ _WOODS = ((0.42, 0.25, 0.13), (0.22, 0.11, 0.06), (0.62, 0.45, 0.28))
 _FABRICS = ("weave", "plaid", "stripes", "clouds", "speckle")
 
 
-class Palette:
+class SurfacePalette:
     """Every call draws a new surface; the same generator draws the same ones."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
 
     def plain(self, *, tone: float | None = None, finish: Finish = Finish.MATTE) -> Surface:
-        """Paint of one colour: nothing for a matcher to hold on to."""
+        """Paint of one colour, without any texture to match."""
         level = self._rng.uniform(0.15, 0.8) if tone is None else tone
         return Surface(finish, self._tinted(level, 0.05), self._rng.uniform(0.1, 0.35))
 

@@ -20,14 +20,14 @@ class BadRecipe(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Effects:
-    """What the final pass's camera does that the clean pass's does not. Zero switches one off."""
+    """The effects of the final pass's camera; zero switches an effect off."""
 
     exposure_s: float = 0.008  # how long each row is exposed
     readout_s: float = 0.012  # from the first row's exposure to the last one's
     aperture_m: float = 0.003  # diameter of the lens
     focus_m: float = 2.0
     glare: float = 0.06  # share of the light that the lens scatters
-    flicker: float = 0.25  # the lamps brighten and dim by so much
+    flicker: float = 0.25  # relative amplitude of the lamps' brightness
     flicker_hz: float = 100.0
 
 
@@ -39,7 +39,7 @@ class Recipe:
     seed: int = 1
     frames: int = 48
     fps: float = 30.0
-    speed: float = 1.0  # of the head along its path; frame k at 6 is frame 6 k at 1
+    speed: float = 1.0  # speed of the head along its path; frame k at 6 is frame 6 k at 1
     width: int = 640
     height: int = 480
     fov_deg: float = 70.0  # across the width
@@ -89,7 +89,7 @@ class Recipe:
 
     @classmethod
     def from_json(cls, text: str, origin: Path) -> Self:
-        """Raises BadRecipe: no JSON, a field that there is not, or a value that cannot be."""
+        """Read a recipe. Raises BadRecipe: no JSON, an unknown field, or an impossible value."""
         try:
             fields: dict[str, Any] = json.loads(text)  # whatever a person wrote
             effects = Effects(**fields.pop("effects", {}))

@@ -1,4 +1,4 @@
-"""The rooms of the benchmark: what is in each kind, and how it is lit."""
+"""The rooms of the benchmark: the furniture and the light of each kind."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from vergence_models.data.trajectories import rotation
-from vergence_models.data.xrbench import furniture, meshes
-from vergence_models.data.xrbench.palette import Palette
-from vergence_models.data.xrbench.plan import Plan, Wall
+from vergence_models.data.xrbench import furniture_meshes, meshes
+from vergence_models.data.xrbench.floor_plan import FloorPlan, Wall
+from vergence_models.data.xrbench.palette import SurfacePalette
 from vergence_models.data.xrbench.things import Finish, Room, Surface, Thing, Workbench, placed
 
 
@@ -18,7 +18,7 @@ def build(kind: str, seed: int) -> Room:
     """A room of a kind in `ROOMS`; the same seed builds the same room."""
     # Each kind draws its own numbers: seed 1 of one is no relative of seed 1 of another.
     rng = np.random.default_rng([seed, list(ROOMS).index(kind)])
-    plan = ROOMS[kind](rng, Palette(rng))
+    plan = ROOMS[kind](rng, SurfacePalette(rng))
     start = np.eye(4)
     look = rng.uniform(-0.15, 0.15) - 0.5 * plan.eye_m[0] / plan.half_z
     start[:3, :3] = rotation(np.array([0, look, 0])) @ rotation(
@@ -31,91 +31,91 @@ def build(kind: str, seed: int) -> Room:
     )  # fmt: skip
 
 
-def living_room(rng: np.random.Generator, p: Palette) -> Plan:
-    plan = Plan(rng, p, half_x=rng.uniform(1.9, 2.4), half_z=rng.uniform(2.2, 2.9), height=2.6)
+def living_room(rng: np.random.Generator, p: SurfacePalette) -> FloorPlan:
+    plan = FloorPlan(rng, p, half_x=rng.uniform(1.9, 2.4), half_z=rng.uniform(2.2, 2.9), height=2.6)
     plan.shell(p.patterned("wood", span_m=1.6), p.plain(tone=0.6), _accent(rng, p))
-    plan.against(Wall.FAR, "sofa", furniture.sofa)
-    plan.against(Wall.FAR, "floor lamp", furniture.floor_lamp)
-    plan.against(Wall.RIGHT, "bookshelf", furniture.bookshelf)
-    plan.against(Wall.LEFT, "cabinet", furniture.cabinet)
-    plan.against(Wall.LEFT, "plant", furniture.plant)
+    plan.against(Wall.FAR, "sofa", furniture_meshes.sofa)
+    plan.against(Wall.FAR, "floor lamp", furniture_meshes.floor_lamp)
+    plan.against(Wall.RIGHT, "bookshelf", furniture_meshes.bookshelf)
+    plan.against(Wall.LEFT, "cabinet", furniture_meshes.cabinet)
+    plan.against(Wall.LEFT, "plant", furniture_meshes.plant)
     _rug(plan, p)
-    plan.anywhere("coffee table", furniture.coffee_table)
-    plan.anywhere("chair", furniture.chair)
-    plan.anywhere("plant", furniture.plant)
+    plan.anywhere("coffee table", furniture_meshes.coffee_table)
+    plan.anywhere("chair", furniture_meshes.chair)
+    plan.anywhere("plant", furniture_meshes.plant)
     _pictures(plan, p, rng, 3)
     plan.light(2, half_m=(0.35, 0.35), radiance=9)
     return plan
 
 
-def office(rng: np.random.Generator, p: Palette) -> Plan:
-    plan = Plan(rng, p, half_x=rng.uniform(2.0, 2.6), half_z=rng.uniform(2.2, 2.8), height=2.7)
+def office(rng: np.random.Generator, p: SurfacePalette) -> FloorPlan:
+    plan = FloorPlan(rng, p, half_x=rng.uniform(2.0, 2.6), half_z=rng.uniform(2.2, 2.8), height=2.7)
     carpet = p.patterned("speckle", "weave", span_m=0.7)
     plan.shell(carpet, p.plain(tone=0.7))
-    plan.against(Wall.FAR, "desk", furniture.desk)
-    plan.against(Wall.RIGHT, "desk", furniture.desk)
-    plan.against(Wall.FAR, "bookshelf", furniture.bookshelf)
-    plan.against(Wall.LEFT, "cabinet", furniture.cabinet)
-    plan.against(Wall.RIGHT, "plant", furniture.plant)
+    plan.against(Wall.FAR, "desk", furniture_meshes.desk)
+    plan.against(Wall.RIGHT, "desk", furniture_meshes.desk)
+    plan.against(Wall.FAR, "bookshelf", furniture_meshes.bookshelf)
+    plan.against(Wall.LEFT, "cabinet", furniture_meshes.cabinet)
+    plan.against(Wall.RIGHT, "plant", furniture_meshes.plant)
     for _ in range(3):
-        plan.anywhere("office chair", furniture.office_chair, yaw=float(rng.uniform(0, 6.3)))
-    plan.anywhere("table", furniture.table)
+        plan.anywhere("office chair", furniture_meshes.office_chair, yaw=float(rng.uniform(0, 6.3)))
+    plan.anywhere("table", furniture_meshes.table)
     _pictures(plan, p, rng, 1)
     plan.light(3, half_m=(0.6, 0.15), radiance=12)
     return plan
 
 
-def kitchen(rng: np.random.Generator, p: Palette) -> Plan:
-    plan = Plan(rng, p, half_x=rng.uniform(1.7, 2.1), half_z=rng.uniform(2.0, 2.5), height=2.5)
+def kitchen(rng: np.random.Generator, p: SurfacePalette) -> FloorPlan:
+    plan = FloorPlan(rng, p, half_x=rng.uniform(1.7, 2.1), half_z=rng.uniform(2.0, 2.5), height=2.5)
     tiles = p.patterned("tiles", span_m=1.2)
     plan.shell(p.patterned("tiles", "stones", span_m=1.0), p.plain(tone=0.7), tiles)
     plan.against(Wall.FAR, "counter", _counter)
     plan.against(Wall.RIGHT, "fridge", _fridge)
-    plan.against(Wall.LEFT, "cabinet", furniture.cabinet)
-    plan.anywhere("table", furniture.table)
+    plan.against(Wall.LEFT, "cabinet", furniture_meshes.cabinet)
+    plan.anywhere("table", furniture_meshes.table)
     for _ in range(3):
-        plan.anywhere("chair", furniture.chair, yaw=float(rng.uniform(0, 6.3)))
+        plan.anywhere("chair", furniture_meshes.chair, yaw=float(rng.uniform(0, 6.3)))
     shelf = Workbench()
     wood = p.wood()
     shelf.box(wood, (0, 0, 0), (0.8, 0.012, 0.1))
-    furniture.set_out(shelf, p, rng, 0.75, 0.03, -0.012, count=6, tall_m=0.25)
+    furniture_meshes.set_out(shelf, p, rng, 0.75, 0.03, -0.012, count=6, tall_m=0.25)
     plan.add("shelf", shelf, placed(rng.uniform(-0.4, 0.4), -1.55, plan.half_z - 0.11))
     plan.light(2, half_m=(0.5, 0.2), radiance=10)
     return plan
 
 
-def bedroom(rng: np.random.Generator, p: Palette) -> Plan:
-    plan = Plan(rng, p, half_x=rng.uniform(1.9, 2.3), half_z=rng.uniform(2.2, 2.6), height=2.5)
+def bedroom(rng: np.random.Generator, p: SurfacePalette) -> FloorPlan:
+    plan = FloorPlan(rng, p, half_x=rng.uniform(1.9, 2.3), half_z=rng.uniform(2.2, 2.6), height=2.5)
     plan.shell(p.patterned("wood", "weave", span_m=1.4), p.plain(tone=0.6), _accent(rng, p))
-    plan.against(Wall.FAR, "bed", furniture.bed)
-    plan.against(Wall.RIGHT, "wardrobe", furniture.wardrobe)
-    plan.against(Wall.LEFT, "cabinet", furniture.cabinet)
-    plan.against(Wall.FAR, "floor lamp", furniture.floor_lamp)
-    plan.anywhere("clothes rack", furniture.clothes_rack)
-    plan.anywhere("chair", furniture.chair)
+    plan.against(Wall.FAR, "bed", furniture_meshes.bed)
+    plan.against(Wall.RIGHT, "wardrobe", furniture_meshes.wardrobe)
+    plan.against(Wall.LEFT, "cabinet", furniture_meshes.cabinet)
+    plan.against(Wall.FAR, "floor lamp", furniture_meshes.floor_lamp)
+    plan.anywhere("clothes rack", furniture_meshes.clothes_rack)
+    plan.anywhere("chair", furniture_meshes.chair)
     _pictures(plan, p, rng, 2)
     plan.hang(Wall.RIGHT, p.mirror(), 0.25, 0.5, 1.4)
     plan.light(1, half_m=(0.5, 0.5), radiance=11)
     return plan
 
 
-def studio(rng: np.random.Generator, p: Palette) -> Plan:
+def studio(rng: np.random.Generator, p: SurfacePalette) -> FloorPlan:
     """Bare walls and few things: the hardest room for a matcher."""
-    plan = Plan(rng, p, half_x=rng.uniform(2.2, 2.8), half_z=rng.uniform(2.4, 3.0), height=3.0)
+    plan = FloorPlan(rng, p, half_x=rng.uniform(2.2, 2.8), half_z=rng.uniform(2.4, 3.0), height=3.0)
     plan.shell(p.plain(tone=0.5, finish=Finish.SATIN), p.plain(tone=0.75))
-    plan.anywhere("table", furniture.table)
-    plan.anywhere("chair", furniture.chair)
-    plan.anywhere("plant", furniture.plant)
-    plan.anywhere("floor lamp", furniture.floor_lamp)
-    plan.anywhere("clothes rack", furniture.clothes_rack)
-    plan.against(Wall.FAR, "sofa", furniture.sofa)
+    plan.anywhere("table", furniture_meshes.table)
+    plan.anywhere("chair", furniture_meshes.chair)
+    plan.anywhere("plant", furniture_meshes.plant)
+    plan.anywhere("floor lamp", furniture_meshes.floor_lamp)
+    plan.anywhere("clothes rack", furniture_meshes.clothes_rack)
+    plan.against(Wall.FAR, "sofa", furniture_meshes.sofa)
     plan.hang(Wall.RIGHT, p.mirror(), 0.3, 0.8, 1.2)
     plan.light(2, half_m=(0.7, 0.4), radiance=8)
     return plan
 
 
-def playroom(rng: np.random.Generator, p: Palette) -> Plan:
-    """Things move: a ball rolls, a box spins in the air, a balloon rises."""
+def playroom(rng: np.random.Generator, p: SurfacePalette) -> FloorPlan:
+    """Objects move: a ball rolls, a box spins in the air, a balloon rises."""
     plan = living_room(rng, p)
     ball, box, balloon = Workbench(), Workbench(), Workbench()
     ball.add(p.patterned("dots", "plaid", span_m=0.3), meshes.ball((0.14,) * 3))
@@ -136,7 +136,7 @@ def playroom(rng: np.random.Generator, p: Palette) -> Plan:
     return plan
 
 
-ROOMS: dict[str, Callable[[np.random.Generator, Palette], Plan]] = {
+ROOMS: dict[str, Callable[[np.random.Generator, SurfacePalette], FloorPlan]] = {
     "living_room": living_room,
     "office": office,
     "kitchen": kitchen,
@@ -146,28 +146,28 @@ ROOMS: dict[str, Callable[[np.random.Generator, Palette], Plan]] = {
 }
 
 
-def _accent(rng: np.random.Generator, p: Palette) -> Surface | None:
+def _accent(rng: np.random.Generator, p: SurfacePalette) -> Surface | None:
     """Wallpaper or bricks on the far wall, or paint like everywhere else."""
     if rng.random() < 0.5:
         return None
     return p.patterned("bricks", "stripes", "clouds", "dots", span_m=float(rng.uniform(0.5, 1.2)))
 
 
-def _rug(plan: Plan, p: Palette) -> None:
+def _rug(plan: FloorPlan, p: SurfacePalette) -> None:
     bench = Workbench()
     bench.box(p.patterned("plaid", "patchwork", "stripes", span_m=1.0), (0, -0.006, 0),
               (0.9, 0.006, 0.65))  # fmt: skip
     plan.add("rug", bench, placed(0, 0, plan.half_z * 0.2, yaw=0.1))
 
 
-def _pictures(plan: Plan, p: Palette, rng: np.random.Generator, count: int) -> None:
+def _pictures(plan: FloorPlan, p: SurfacePalette, rng: np.random.Generator, count: int) -> None:
     for _ in range(count):
         side = (Wall.FAR, Wall.RIGHT)[int(rng.integers(2))]
         half_x, half_y = rng.uniform(0.15, 0.4, 2)
         plan.hang(side, p.picture(), half_x, half_y, rng.uniform(1.4, 1.7))
 
 
-def _counter(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
+def _counter(b: Workbench, p: SurfacePalette, rng: np.random.Generator) -> None:
     """Cupboards under a worktop, with a tap, pots and crockery."""
     half_x, body, metal = rng.uniform(1.0, 1.3), p.plain(finish=Finish.SATIN), p.metal()
     b.box(body, (0, -0.44, 0.02), (half_x, 0.44, 0.27))
@@ -181,10 +181,12 @@ def _counter(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
     b.rods(metal, 0.012, (foot, bend), (bend, mouth))
     for x in (0.15, 0.42):
         b.add(metal, meshes.lathe([(0.11, -0.13), (0.11, 0), (0.001, 0)]), (x, -0.92, 0.05))
-    furniture.set_out(b, p, rng, half_x * 0.9, 0.1, -0.92, count=5, tall_m=0.3, front_m=-0.12)
+    furniture_meshes.set_out(
+        b, p, rng, half_x * 0.9, 0.1, -0.92, count=5, tall_m=0.3, front_m=-0.12
+    )
 
 
-def _fridge(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
+def _fridge(b: Workbench, p: SurfacePalette, rng: np.random.Generator) -> None:
     paint = p.plain(tone=0.7, finish=Finish.SATIN)
     b.box(paint, (0, -0.9, 0.02), (0.3, 0.9, 0.3))
     for y, half in ((-0.6, 0.58), (-1.5, 0.28)):

@@ -1,4 +1,4 @@
-"""One picture of everything that is known about a frame."""
+"""A contact sheet: one picture of all images and truths of a frame."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Image = NDArray[np.uint8]  # [H, W, 3], RGB
 def contact_sheet(folder: Path, name: str, frame: int) -> Image:
     """The passes there are, disparity, flow, normals, and objects in their boxes: [H, W, 3], RGB.
 
-    Raises LayoutError: a file of the frame is missing or damaged.
+    Raises DatasetError: a file of the frame is missing or damaged.
     """
     left = Path(name) / "left"
     passes = [folder / f"frames_{each}pass" / left / f"{frame:04d}.png" for each in PASSES]

@@ -1,4 +1,4 @@
-"""What scenes are made of: surfaces, things with parts in a frame of their own, lamps, a sky."""
+"""The contents of scenes: surfaces, things with parts in a frame of their own, lamps, a sky."""
 
 from __future__ import annotations
 

@@ -41,22 +41,22 @@ class Optics:
 
 
 @dataclass(frozen=True, slots=True)
-class View:
-    """What a camera sees of: some rows of its image, through one point of its lens.
+class CameraView:
+    """Some rows of a camera's image, seen through one point of its lens.
 
-    A lens is the average of pinholes at its points, each turned so that what lies at the focus
-    stays where it is in the image.
+    A lens is the average of pinholes at its points, each turned so that points in focus keep their
+    place in the image.
     """
 
     first_row: int
     rows: int
-    lens_m: tuple[float, float] = (0.0, 0.0)  # the point, right and down of the middle
+    lens_m: tuple[float, float] = (0.0, 0.0)  # the point of the lens, right and down of its middle
     focus_m: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Hits:
-    """What the rays through the centres of pixels meet first, in world axes."""
+class FirstHits:
+    """The first hits of the rays through the pixel centres, in world axes."""
 
     points_m: NDArray[np.float64]  # [H, W, 3]
     normals: NDArray[np.float64]  # [H, W, 3], unit, of the smooth surface
@@ -65,8 +65,8 @@ class Hits:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Light:
-    """What pixels receive, averaged over their area, and the first surfaces behind it."""
+class TracedLight:
+    """The light that pixels receive, averaged over their area, and the first surfaces."""
 
     radiance: Planes  # [H, W, 3], linear RGB
     albedo: Planes  # [H, W, 3]
@@ -75,7 +75,7 @@ class Light:
 
 
 class Tracer:
-    """A room in Mitsuba's hands. Not for several threads at once.
+    """A room loaded into Mitsuba. Not safe for use by several threads at once.
 
     Raises NoRenderer: Mitsuba is not installed, or the variant lacks its library.
     """
@@ -104,7 +104,7 @@ class Tracer:
         path = {"type": "path", "max_depth": bounces + 1, "rr_depth": bounces + 1}
         self._light = self._mi.load_dict({"type": "aov", "aovs": _BESIDE_LIGHT, "light": path})
         self._first_hit = self._mi.load_dict({"type": "aov", "aovs": _FIRST_HIT})
-        # Unoptimised: merged meshes would lose the names that truth is told apart by.
+        # Without optimisation: merged meshes would lose the names that separate objects in truth.
         self._scene = self._mi.load_dict(scene, optimize=False)
         order = [shape.id() for shape in self._scene.shapes()]
         names = [name for name in scene if name.startswith(("thing", "lamp"))]
@@ -117,12 +117,12 @@ class Tracer:
         self._parameters = self._mi.traverse(self._scene)
         self._sensors: dict[tuple[Optics, int | None, bool], tuple[Any, Any]] = {}
 
-    def hits(self, optics: Optics, world_from_camera: Matrix, time_s: float) -> Hits:
+    def hits(self, optics: Optics, world_from_camera: Matrix, time_s: float) -> FirstHits:
         """Exact: one ray through the centre of each pixel of a pinhole camera."""
         planes = self._render(optics, world_from_camera, time_s, samples=1, seed=0, centred=True)
         planes = planes[..., -8:]  # the film puts a colour before them
         index = np.where(planes[..., 0] > 0, planes[..., 4], 0).astype(int)
-        return Hits(
+        return FirstHits(
             points_m=planes[..., 5:8].astype(np.float64),
             normals=planes[..., 1:4].astype(np.float64),
             label=self._label[index],
@@ -131,8 +131,8 @@ class Tracer:
 
     def light(
         self, optics: Optics, world_from_camera: Matrix, time_s: float, *, samples: int, seed: int,
-        flicker: float = 1.0, view: View | None = None,
-    ) -> Light:  # fmt: skip
+        flicker: float = 1.0, view: CameraView | None = None,
+    ) -> TracedLight:  # fmt: skip
         """Path-traced, of the whole image or the rows of a view. `flicker` scales the lamps."""
         if flicker != self._flicker:
             for index, lamp in enumerate(self._room.lamps):
@@ -143,14 +143,14 @@ class Tracer:
         planes = self._render(
             optics, world_from_camera, time_s, samples=samples, seed=seed, view=view
         )
-        return Light(planes[..., :3], planes[..., 7:10], planes[..., 4:7], planes[..., 3:4])
+        return TracedLight(planes[..., :3], planes[..., 7:10], planes[..., 4:7], planes[..., 3:4])
 
     def _render(
         self, optics: Optics, world_from_camera: Matrix, time_s: float, *, samples: int, seed: int,
-        view: View | None = None, centred: bool = False,
+        view: CameraView | None = None, centred: bool = False,
     ) -> Planes:  # fmt: skip
         self._move_things(time_s)
-        view = view or View(0, optics.height)
+        view = view or CameraView(0, optics.height)
         sensor, parameters = self._sensor(optics, view.rows, centred)
         frame = world_from_camera.copy()
         frame[:3, 3] += frame[:3, :2] @ view.lens_m
@@ -168,7 +168,7 @@ class Tracer:
         return np.array(image, np.float32)
 
     def _shape_ids(self) -> list[int]:
-        """What the `shape_index` plane says of each shape; it is 0 where there is none."""
+        """The value of the `shape_index` plane for each shape; 0 means no shape."""
         shapes = self._scene.shapes()
         if self._mi.variant().startswith("scalar"):
             return list(range(1, len(shapes) + 1))
@@ -191,7 +191,7 @@ class Tracer:
         self._time_s = time_s
 
     def _sensor(self, optics: Optics, rows: int, centred: bool) -> tuple[Any, Any]:
-        """Kept: a new camera of the same kind would be compiled anew by the JIT variants."""
+        """A cached sensor: the JIT variants would compile a new camera of the same kind again."""
         key = (optics, rows, centred)
         if key not in self._sensors:
             sampler: dict[str, Any] = {"type": "independent"}

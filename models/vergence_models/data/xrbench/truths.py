@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from vergence_models.data.xrbench.meshes import Matrix
 from vergence_models.data.xrbench.things import Room
-from vergence_models.data.xrbench.tracer import Hits, Optics
+from vergence_models.data.xrbench.tracer import FirstHits, Optics
 
 Plane = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """Where the points that pixels see are in another frame; NaN behind that camera."""
+    """The position in another frame of the points that pixels see; NaN behind that camera."""
 
     flow_px: Plane  # [H, W, 2]: then minus now
     depth_m: Plane  # [H, W]: then, along the optical axis
@@ -51,7 +51,7 @@ def rays(optics: Optics) -> Plane:
     return _f32(directions / np.linalg.norm(directions, axis=-1, keepdims=True))
 
 
-def depth_m(hits: Hits, world_from_camera: Matrix) -> Plane:
+def depth_m(hits: FirstHits, world_from_camera: Matrix) -> Plane:
     """Metres [H, W] along the optical axis."""
     z = (hits.points_m - world_from_camera[:3, 3]) @ world_from_camera[:3, 2]
     return _f32(np.where(hits.label > 0, z, np.inf))
@@ -62,7 +62,7 @@ def disparity_px(depth: Plane, focal_px: float, baseline_m: float) -> Plane:
     return _f32(focal_px * baseline_m / depth)
 
 
-def normals(hits: Hits, world_from_camera: Matrix) -> Plane:
+def normals(hits: FirstHits, world_from_camera: Matrix) -> Plane:
     """Unit vectors [H, W, 3], camera axes, towards the camera; zero for the sky."""
     to_camera = world_from_camera[:3, 3] - hits.points_m
     away = np.einsum("hwk,hwk->hw", hits.normals, to_camera) < 0
@@ -73,7 +73,11 @@ def normals(hits: Hits, world_from_camera: Matrix) -> Plane:
 
 
 def motion(
-    hits: Hits, room: Room, optics: Optics, now: tuple[float, Matrix], then: tuple[float, Matrix]
+    hits: FirstHits,
+    room: Room,
+    optics: Optics,
+    now: tuple[float, Matrix],
+    then: tuple[float, Matrix],
 ) -> Motion:
     """Follow every pixel's point, on still and on moving things, hidden or not.
 
@@ -96,8 +100,8 @@ def motion(
     return Motion(_f32(there - here), _f32(np.where(sky, np.inf, z)))
 
 
-def boxes(hits: Hits, room: Room, time_s: float) -> list[Box]:
-    """Of all that is seen, if only by a pixel: the tightest box around it, and its place."""
+def boxes(hits: FirstHits, room: Room, time_s: float) -> list[Box]:
+    """The tightest box around each thing that at least one pixel sees, and its pose."""
     found: list[Box] = []
     for label in np.unique(hits.label[hits.label > 0]).tolist():
         v, u = np.nonzero(hits.label == label)

@@ -1,4 +1,4 @@
-"""Sequences on disk, in the layout of SceneFlow, with what SceneFlow leaves out beside it.
+"""Sequences on disk, in the layout of SceneFlow, and further truths that SceneFlow lacks.
 
 For a sequence NAME in a folder::
 
@@ -15,8 +15,8 @@ For a sequence NAME in a folder::
     rays/NAME/left.npy                                     float32 [H, W, 3], unit, every frame's
     recipes/NAME.json
 
-Every file is written under another name and renamed when whole: a stopped run goes on at the
-frame where it was, and what is there can be read meanwhile.
+Every file is written under another name and renamed when complete: a stopped run continues at its
+last frame, and finished files can be read meanwhile.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def render_sequence(
     recipe: Recipe, folder: Path, *, passes: tuple[str, ...] = PASSES,
     variant: str | None = None, on_frame: Callable[[], None] = lambda: None,
 ) -> Path:  # fmt: skip
-    """Render what is missing of a sequence, and give where its best pass lies.
+    """Render the missing frames of a sequence, and return the folder of its best pass.
 
     Raises BadRecipe: the folder holds a sequence of the same name by another recipe. NoRenderer:
     as `StereoCamera`.
@@ -66,7 +66,7 @@ def render_sequence(
 
 
 def _claim(recipe: Recipe, folder: Path) -> int:
-    """State the recipe in the folder, and give how many frames the sequence has there."""
+    """Write the recipe to the folder, and return the number of frames of the sequence there."""
     path = folder / "recipes" / f"{recipe.name}.json"
     if path.exists():
         there = Recipe.from_json(path.read_text("utf-8"), path)
@@ -89,7 +89,7 @@ def _image_path(name: str, which: str, eye: Eye, frame: int) -> Path:
 
 
 def _files(camera: StereoCamera, frame: int, passes: tuple[str, ...]) -> Mapping[Path, bytes]:
-    """Every file of a frame. The left images come last: whoever finds one finds the rest."""
+    """All files of a frame. The left images come last: if one exists, so do all other files."""
     name = camera.recipe.name
     shoot = {"clean": camera.clean, "final": camera.final}
     images = {
@@ -145,7 +145,7 @@ def _words(world_from_camera: Matrix) -> str:
 
 
 def encode_png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
-    """Of grey [H, W] or RGB [H, W, 3]."""
+    """Encode grey [H, W] or RGB [H, W, 3]."""
     turned = image[..., ::-1] if image.ndim == 3 else image
     done, data = cv2.imencode(".png", np.ascontiguousarray(turned))
     assert done, f"OpenCV encodes every image of {image.dtype} {image.shape}"

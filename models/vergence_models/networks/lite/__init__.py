@@ -1,1 +1,1 @@
-"""The `lite` tier: the recurrence on an encoder made for CPUs."""
+"""The `lite` tier: our network, made for CPUs."""

@@ -27,26 +27,26 @@ REACH = 2  # entries looked up on either side of the current disparity
 TAPS = 2 * REACH + 1
 FILLS = 3  # surfaces that the surroundings suggest: the smooth, the farthest, the nearest one
 HYPOTHESES = 2 + FILLS  # with the current disparity and the best of the scores
-CELL_INPUTS = TAPS + 2 * FILLS + 5  # what the cell sees besides the context
-MIN_PX = 0.1  # no answer is nearer to infinity
+CELL_INPUTS = TAPS + 2 * FILLS + 5  # inputs of the cell besides the context
+MIN_PX = 0.1  # the smallest disparity of a result
 
 
-class Clues(NamedTuple):
-    """What the scores of the wide search are made of, as far as two images alone say it."""
+class CostFeatures(NamedTuple):
+    """The inputs of the cost filter that depend on the two images alone."""
 
     fixed: Tensor  # [B, D, H, W] at 1/8, largest disparity first: scores before anything learned
-    features: Tensor  # [B D, C, H/2, W/2]: what the learned filter sees of them
+    features: Tensor  # [B D, C, H/2, W/2]: input of the learned filter
 
 
 class CostFilter(nn.Module):
     """Coarse scores from the raw volume.
 
-    Box windows of three sizes, a doubt about matches that another surface claims too, and a learned
-    residual.
+    A score is the sum of box windows of three sizes, a penalty on matches that another surface
+    claims too, and a learned residual.
 
-    The residual is the same small network for every disparity (folded into the batch), told what
-    the image looks like and where the previous frame's surface lies: what it learns at one
-    disparity holds at all of them.
+    The residual is the same small network for every disparity (folded into the batch). Its inputs
+    include the image's context and the previous frame's surface. What it learns at one disparity
+    holds at all of them.
     """
 
     def __init__(self, config: LiteNetworkConfig) -> None:
@@ -62,7 +62,7 @@ class CostFilter(nn.Module):
         self.middle = conv(width, width, kernel=1)
         self.leave = silent(conv(width, 4, kernel=1))
 
-    def clues(self, volume: Tensor) -> Clues:
+    def cost_features(self, volume: Tensor) -> CostFeatures:
         """``volume`` [B, H, W, D] at 1/8."""
         batch, height, width, bins = volume.shape
         narrow = volume.permute(0, 3, 1, 2)
@@ -74,27 +74,27 @@ class CostFilter(nn.Module):
         channels = (narrow, middle, lead.clamp(min=-1), claim.clamp(min=-1))
         stacked = torch.stack(channels, dim=2)
         features = self.enter(stacked.reshape(batch * bins, len(channels), height, width))
-        return Clues(fixed + 10 * self.mutual * claim, features)
+        return CostFeatures(fixed + 10 * self.mutual * claim, features)
 
-    def forward(self, clues: Clues, context: Tensor, prior: Tensor) -> Tensor:
+    def forward(self, cost_features: CostFeatures, context: Tensor, prior: Tensor) -> Tensor:
         """Scores [B, H, W, D]; ``context`` [B, C, H/2, W/2], ``prior`` [B, 1, H, W] px or 0."""
-        batch, bins, height, width = clues.fixed.shape
+        batch, bins, height, width = cost_features.fixed.shape
         # Where nothing is expected, nothing is near.
         expected_px = F.pixel_unshuffle(prior - (prior <= 0).to(prior.dtype) * 1e3, 2)
         bin_px = torch.arange(bins - 1, -1, -1, device=prior.device).to(prior.dtype) * BIN_PX
         apart_px = expected_px.reshape(batch, 1, -1) - bin_px[:, None]
         near = (1 - apart_px.abs() * (0.5 / BIN_PX)).clamp(min=0)
-        x = clues.features + self.expected(near.view(-1, 4, height // 2, width // 2))
+        x = cost_features.features + self.expected(near.view(-1, 4, height // 2, width // 2))
         x = x.view(batch, bins, -1, height // 2, width // 2) + context[:, None]
         x = F.relu6(x).view(batch * bins, -1, height // 2, width // 2)
         low = F.relu6(self.low(F.relu6(self.down(x))))
         x = F.relu6(self.middle(x + enlarge(low)))
         residual = F.pixel_shuffle(self.leave(x), 2).view(batch, bins, height, width)
-        return (clues.fixed + residual).permute(0, 2, 3, 1)
+        return (cost_features.fixed + residual).permute(0, 2, 3, 1)
 
 
 def coarse_position(d: Tensor, last: int) -> Tensor:
-    """Where disparity ``d`` px lies among the coarse scores, the last of which is that of 0 px."""
+    """The index of disparity ``d`` px among the coarse scores; the last one is that of 0 px."""
     return last - d * (1 / BIN_PX)
 
 
@@ -114,9 +114,9 @@ def peak(volume: Volume) -> tuple[Tensor, Tensor]:
 
 
 def smooth_fill(d: Tensor, confidence: Tensor) -> Tensor:
-    """What confident surroundings say: a pull-push pyramid of confidence-weighted means. [B,1,H,W].
+    """Fill from confident cells: a pull-push pyramid of confidence-weighted means, [B, 1, H, W].
 
-    Where a cell is confident it hears itself and its neighbours; on a blank wall, the wall's rim.
+    A confident cell is averaged with its neighbours; a cell on a blank wall takes the wall's rim.
     """
     weight = confidence + 1e-4
     both = torch.cat((d * weight, weight), dim=1)
@@ -132,8 +132,8 @@ def smooth_fill(d: Tensor, confidence: Tensor) -> Tensor:
 def extremes(d: Tensor, confidence: Tensor, otherwise: Tensor) -> Tensor:
     """The farthest and the nearest surface among confident neighbours, [B, 2, H, W].
 
-    The farthest is what an occluded cell shows, the nearest what a blank or thin thing is part of.
-    Mostly along the row; ``otherwise`` where no neighbour is confident.
+    An occluded cell shows the farthest; a blank or thin object is part of the nearest. The window
+    extends mostly along the row. Without a confident neighbour the result is ``otherwise``.
     """
     doubt = 1e3 * (confidence < 0.5).to(d.dtype)
     both = torch.cat((-d - doubt, d - doubt), dim=1)
@@ -146,16 +146,16 @@ def extremes(d: Tensor, confidence: Tensor, otherwise: Tensor) -> Tensor:
 
 
 def beyond(d: Tensor, *, scale: int) -> Tensor:
-    """How many cells the match lies beyond the left border of the right image, -1 to 1.
+    """The distance of the match beyond the left border of the right image, in cells, -1 to 1.
 
-    ``d`` [B, K, H, W] px at 1/``scale``. Nothing can match there: what looks like it is noise.
+    ``d`` [B, K, H, W] px at 1/``scale``. Nothing can match there: an apparent match is noise.
     """
     u, _ = cell_centres(d.shape[2], d.shape[3], scale, d)
     return ((d - u) * (1 / scale)).clamp(-1, 1)
 
 
 class CoarseUpdate(nn.Module):
-    """One iteration at 1/8: look at the scores round the current disparity, choose, correct."""
+    """One iteration at 1/8: read the scores around the current disparity, choose, correct."""
 
     def __init__(self, config: LiteNetworkConfig) -> None:
         super().__init__()
@@ -168,14 +168,14 @@ class CoarseUpdate(nn.Module):
         hidden: Tensor,
         d: Tensor,
         *,
-        guess: tuple[Tensor, Tensor],
+        peak: tuple[Tensor, Tensor],
         fills: Tensor,
         hole: Tensor,
         scores: Volume,
         context: Tensor,
     ) -> tuple[Tensor, Tensor, Hypotheses]:
-        """Hidden state and disparity [B, 1, H, W] px to the next ones; what was chosen among."""
-        guess_px, guess_log = guess
+        """Return the next hidden state, the next disparity [B, 1, H, W] px, and the hypotheses."""
+        peak_px, peak_log = peak
         top = scores.scores.amax(dim=-1)[:, None]
         around = lookup_row(scores, coarse_position(d, scores.last), REACH)
         at_fills = lookup(scores, coarse_position(fills, scores.last))
@@ -184,8 +184,8 @@ class CoarseUpdate(nn.Module):
             (
                 context,
                 log_p * 0.1,
-                guess_log,
-                squash(torch.cat((guess_px, fills), dim=1) - d, 2.0),
+                peak_log,
+                squash(torch.cat((peak_px, fills), dim=1) - d, 2.0),
                 hole,
                 d * (1 / 64),
                 beyond(d, scale=8),
@@ -194,10 +194,10 @@ class CoarseUpdate(nn.Module):
         )
         hidden = self.cell(hidden, inputs)
         learned = self.out(F.relu(self.head(hidden)))
-        # Fixed part of the choice: the score itself, and a doubt about guesses that are not unique.
+        # The fixed part of the choice is the score, and a penalty on peaks that are not unique.
         kept, at_fills = log_p[:, REACH : REACH + 1], log_p[:, TAPS:]
-        fixed = torch.cat((kept + 1, 2 * guess_log, at_fills - 1), dim=1)
-        surfaces = torch.cat((d, guess_px, fills), dim=1)
+        fixed = torch.cat((kept + 1, 2 * peak_log, at_fills - 1), dim=1)
+        surfaces = torch.cat((d, peak_px, fills), dim=1)
         hypotheses = Hypotheses(surfaces, fixed + 4 * learned[:, :HYPOTHESES])
         d = (hypotheses.mean() + 4 * learned[:, HYPOTHESES:]).clamp(min=MIN_PX)
         return hidden, d, hypotheses

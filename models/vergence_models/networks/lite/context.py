@@ -1,4 +1,4 @@
-"""What the left image alone says."""
+"""Context features of the left image."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ PATCH_BYTES = 4 * 4 * 3
 
 
 class Context(nn.Module):
-    """What the left image alone says, at 1/4, 1/8 and 1/16, with a view down to 1/32.
+    """Context features of the left image at 1/4, 1/8 and 1/16; their receptive field reaches 1/32.
 
-    Activations are bounded where nothing normalises them. Unbounded, they grew a hundred thousand
-    times larger in training than the evidence they stand beside, and closed every gate for good.
+    Activations are bounded where nothing normalises them. Without bounds they grew in training to
+    a hundred thousand times the matching scores beside them, and closed every gate for good.
     """
 
     def __init__(self, config: LiteNetworkConfig) -> None:

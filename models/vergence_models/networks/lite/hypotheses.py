@@ -1,4 +1,4 @@
-"""A handful of disparities that a cell may have, and how they are weighed: at 1/8 and at 1/4."""
+"""A few candidate disparities of each cell and their weights, at 1/8 and at 1/4."""
 
 from __future__ import annotations
 
@@ -23,11 +23,12 @@ class Hypotheses(NamedTuple):
         return expected(self.scores, self.surfaces)
 
     def unlikelihood(self, truth_px: Tensor, max_disparity_px: int, *, scale: int) -> Tensor:
-        """Of the truth [B, H, W], under a Laplace distribution round each hypothesis: a scalar.
+        """Negative log-likelihood of the truth [B, H, W], a scalar.
 
-        The error of a mean says little about which hypothesis was right, and nothing about one that
-        is all but ruled out; this says it as loudly for near ones as for far ones. Four pixels of
-        each cell of 1/``scale`` vote. Nothing flows back to the disparities.
+        Each hypothesis is the centre of a Laplace distribution. The error of the mean says little
+        about which hypothesis was right, and nothing about one with almost no weight; the
+        likelihood does, for near and far hypotheses alike. Four pixels of each cell of 1/``scale``
+        vote. No gradient flows to the disparities.
         """
         log_shares = F.log_softmax(self.scores, dim=1)
         first, second = scale // 4, 3 * scale // 4

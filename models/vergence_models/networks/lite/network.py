@@ -1,14 +1,14 @@
-"""The network of `lite`: a wide coarse search, a narrow fine one, and time to join them.
+"""The network of `lite`: a wide coarse search and a narrow fine search, joined over time.
 
-The wide search is coarse (every disparity, cells of 1/8), the narrow one fine (a handful of
-hypotheses per cell of 1/4); time joins them: the previous disparity, moved to the new view, is what
-the wide search starts from, and what the answer of the narrow one is blended with where they agree.
-Choosing and blending is learned; matching itself starts from fixed census descriptors, so the
-untrained network is already a stereo matcher.
+The wide search covers every disparity in cells of 1/8. The narrow search weighs a few hypotheses
+per cell of 1/4. The previous disparity, warped to the new view, is the prior of the wide search,
+and the result of the narrow search is blended with it where the two agree. Choosing and blending
+is learned. Matching starts from fixed census descriptors, so the untrained network is already a
+stereo matcher.
 
-An iteration is all that depends on what is expected: both choices and the recurrent cell. The next
-iteration expects its answer, as the next frame does; so a second one is what seeing the same frame
-again would be, and a network that improves over frames improves over iterations.
+An iteration contains everything that depends on the prior: both choices and the recurrent cell. Its
+result is the prior of the next iteration, and of the next frame. So a second iteration acts like
+the same frame seen again, and a network that improves over frames also improves over iterations.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from vergence_models.config import LiteNetworkConfig
-from vergence_models.networks.base import Estimate, Found, State, StereoNetwork
+from vergence_models.networks.base import Estimate, State, StepOutput, StereoNetwork
 from vergence_models.networks.cost_volume import whole_rows
 from vergence_models.networks.layers import CensusDescriptor, added, all_pairs, banded
 from vergence_models.networks.lite.coarse import (
     BIN_PX,
-    Clues,
     CoarseUpdate,
+    CostFeatures,
     CostFilter,
     extremes,
     peak,
@@ -35,8 +35,8 @@ from vergence_models.networks.lite.coarse import (
 )
 from vergence_models.networks.lite.context import Context
 from vergence_models.networks.lite.hypotheses import Hypotheses
-from vergence_models.networks.lite.losses import search_cross_entropy
 from vergence_models.networks.lite.refinement import Refined, Refinement, near_columns
+from vergence_models.networks.lite.search_loss import search_cross_entropy
 from vergence_models.networks.lite.upscaled import joined, larger_image, larger_state
 from vergence_models.networks.losses import known, masked_mean, output_loss, robust
 from vergence_models.networks.warp import warp_state
@@ -44,24 +44,24 @@ from vergence_proto.model_io import StateTensor
 
 
 class LiteState(NamedTuple):
-    """What one step hands to the next, and within it one iteration to the next."""
+    """The recurrent state, from step to step and from iteration to iteration."""
 
     disparity: Tensor  # float32 [B, 1, H/4, W/4], full-resolution pixels, 0 = nothing known
     hidden: Tensor  # float32 [B, C, H/8, W/8]
 
 
-class Evidence(NamedTuple):
-    """What two images say by themselves: made once, whatever the iterations."""
+class MatchingFeatures(NamedTuple):
+    """Features that depend on the two images alone; computed once for all iterations."""
 
-    clues: Clues
+    cost_features: CostFeatures
     pairs: Tensor  # at 1/4, see Near.pairs
     context4: Tensor  # [B, C, H/4, W/4]
     context8: Tensor
     context16: Tensor  # as the cost filter takes it
 
 
-class Guess(NamedTuple):
-    """What an iteration found at one scale, and what it chose among."""
+class CoarseEstimate(NamedTuple):
+    """The disparity of an iteration at one scale below the full one, and its hypotheses."""
 
     disparity: Tensor  # [B, 1, H/scale, W/scale] px
     hypotheses: Hypotheses
@@ -75,25 +75,25 @@ class Guess(NamedTuple):
 
 
 class Iteration(NamedTuple):
-    """What one iteration found."""
+    """The results of one iteration."""
 
     answer: Refined
     hidden: Tensor  # [B, C, H/8, W/8]
-    scores: Tensor  # of the wide search, as in LiteEstimate
-    guesses: tuple[Guess, Guess]
+    scores: Tensor  # coarse scores, as in LiteEstimate
+    coarse_estimates: tuple[CoarseEstimate, CoarseEstimate]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiteEstimate(Estimate):
-    """The answer, and the guesses on the way to it."""
+    """The estimate, and the inner estimates before it."""
 
     coarse_scores: Tensor  # [B, H/8, W/8, D]: unnormalised log-probability, largest disparity first
-    guesses: list[Guess]  # at both scales, of each iteration
+    coarse_estimates: list[CoarseEstimate]  # at both scales, of each iteration
 
     def loss(self, truth_px: Tensor, max_disparity_px: int) -> Tensor:
-        """Of the answer, its sigma, both scales on the way, and the coarse scores themselves."""
+        """The sum of losses of disparity, sigma, both inner scales and the coarse scores."""
         loss = output_loss(self.disparity, self.sigma, truth_px, max_disparity_px)
-        losses = [guess.loss(truth_px, max_disparity_px) for guess in self.guesses]
+        losses = [each.loss(truth_px, max_disparity_px) for each in self.coarse_estimates]
         loss = loss + 2 / len(losses) * added(losses)
         search = search_cross_entropy(self.coarse_scores, truth_px, max_disparity_px, bin_px=BIN_PX)
         return loss + 0.2 * search
@@ -128,78 +128,83 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         following = self.moved(LiteState(*state), uvd_curr_from_prev)
         return self.iterated(self.search(left, right), following, iterations)
 
-    def closer_look(self, left: Tensor, right: Tensor, found: Found, iterations: int) -> Found:
+    def refine_at_2x(
+        self, left: Tensor, right: Tensor, found: StepOutput, iterations: int
+    ) -> StepOutput:
         search = self.search(larger_image(left), larger_image(right))
         state = LiteState(*larger_state(*found.state))
         estimate, state = self.iterated(search, state, iterations)
-        closer = Found(estimate.disparity, estimate.sigma, state)
-        return joined(found, closer, self.config.max_disparity_px)
+        at_2x = StepOutput(estimate.disparity, estimate.sigma, state)
+        return joined(found, at_2x, self.config.max_disparity_px)
 
     def iterated(
-        self, evidence: Evidence, state: LiteState, iterations: int
+        self, matching: MatchingFeatures, state: LiteState, iterations: int
     ) -> tuple[LiteEstimate, LiteState]:
-        """The answer after so many iterations, from a state in the view of this frame."""
-        guesses: list[Guess] = []
+        """The estimate after so many iterations, from a state in the view of this frame."""
+        estimates: list[CoarseEstimate] = []
         for _ in range(iterations):
-            found = self.iterate(evidence, state)
+            found = self.iterate(matching, state)
             state = LiteState(found.answer.disparity, found.hidden)
-            guesses += found.guesses
+            estimates += found.coarse_estimates
         disparity, sigma = self.refinement.enlarged(found.answer)
-        return LiteEstimate(disparity, sigma, found.scores, guesses), state
+        return LiteEstimate(disparity, sigma, found.scores, estimates), state
 
     def moved(self, state: LiteState, uvd_curr_from_prev: Tensor) -> LiteState:
         """The state of the previous frame in the view of this one."""
         return LiteState(*warp_state(*state, uvd_curr_from_prev, scale=4, hidden_scale=8))
 
-    def search(self, left: Tensor, right: Tensor) -> Evidence:
-        """What the images say by themselves; [B, H, W, 3] uint8 each."""
-        return Evidence(self.search_wide(left, right), *self.search_narrow(left, right))
+    def search(self, left: Tensor, right: Tensor) -> MatchingFeatures:
+        """Compute all that depends on the images alone; uint8 [B, H, W, 3] each."""
+        return MatchingFeatures(self.search_wide(left, right), *self.search_narrow(left, right))
 
-    def search_wide(self, left: Tensor, right: Tensor) -> Clues:
-        """All disparities, at 1/8."""
+    def search_wide(self, left: Tensor, right: Tensor) -> CostFeatures:
+        """The inputs of the wide search: all disparities, at 1/8."""
         pairs = all_pairs(
             self.coarse_descriptor(gray(left, 4), 2), self.coarse_descriptor(gray(right, 4), 1)
         )
-        return self.cost_filter.clues(banded(pairs, self.bins))
+        return self.cost_filter.cost_features(banded(pairs, self.bins))
 
     def search_narrow(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Pairs at 1/4, and the context: what :class:`Evidence` holds besides the clues."""
+        """Pairs at 1/4 and the context: all other fields of :class:`MatchingFeatures`."""
         left_fine = self.fine_descriptor(gray(left, 2), 2)
         right_fine = self.fine_descriptor(gray(right, 2), 1)
         quarter, eighth, sixteenth = self.context(left)
         pairs = self.near.pairs(left_fine, right_fine)
         return pairs, quarter, eighth, self.cost_filter.context(sixteenth)
 
-    def iterate(self, evidence: Evidence, state: LiteState) -> Iteration:
-        """From the surface that is expected to a better one, by both searches."""
+    def iterate(self, matching: MatchingFeatures, state: LiteState) -> Iteration:
+        """Improve the prior disparity by both searches."""
         prior, hidden = state
         seen = (prior > 0).to(prior.dtype)
         seen8 = F.avg_pool2d(seen, 2)
         hole8 = (seen8 <= 0).to(prior.dtype)
         prior8 = F.avg_pool2d(prior, 2) / seen8.clamp(min=0.1)
-        scores = whole_rows(self.cost_filter(evidence.clues, evidence.context16, prior8))
-        guess = peak(scores)
-        confidence = torch.exp(4 * guess[1])
-        fill = smooth_fill(guess[0], confidence)
+        scores = whole_rows(self.cost_filter(matching.cost_features, matching.context16, prior8))
+        best = peak(scores)
+        confidence = torch.exp(4 * best[1])
+        fill = smooth_fill(best[0], confidence)
         hidden, d, hypotheses = self.update(
             hidden,
             prior8 + hole8 * (fill - prior8),
-            guess=guess,
-            fills=torch.cat((fill, extremes(guess[0], confidence, fill)), dim=1),
+            peak=best,
+            fills=torch.cat((fill, extremes(best[0], confidence, fill)), dim=1),
             hole=hole8,
             scores=scores,
-            context=evidence.context8,
+            context=matching.context8,
         )
-        pairs = self.near.volume(evidence.pairs)
-        answer, chosen_among = self.refinement(pairs, d, hidden, prior, evidence.context4)
-        guesses = Guess(d, hypotheses, 8), Guess(answer.disparity, chosen_among, 4)
-        return Iteration(answer, hidden, scores.scores, guesses)
+        pairs = self.near.volume(matching.pairs)
+        answer, chosen_among = self.refinement(pairs, d, hidden, prior, matching.context4)
+        estimates = (
+            CoarseEstimate(d, hypotheses, 8),
+            CoarseEstimate(answer.disparity, chosen_among, 4),
+        )
+        return Iteration(answer, hidden, scores.scores, estimates)
 
 
 def gray(image: Tensor, scale: int) -> Tensor:
     """Mean of the colours of blocks of pixels: uint8 [B, H, W, 3] to [B, 1, H/scale, W/scale].
 
-    Two rows speak for a block. Their sums are a product with ones: of bytes, that is quick.
+    Two rows represent a block. Their sums are a product with ones, which is fast on bytes.
     """
     batch, height, width, _ = image.shape
     ones = torch.eye(32 // scale, device=image.device).repeat_interleave(3 * scale, dim=0)

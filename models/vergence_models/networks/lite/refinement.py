@@ -1,4 +1,4 @@
-"""The fine search, at 1/4: a handful of hypotheses per cell, and the way to full size."""
+"""The fine search at 1/4: a few hypotheses per cell, and the upsampling to full size."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ TAPS = 2 * REACH + 1
 
 
 def near_columns(max_disparity_px: int) -> Near:
-    """The columns of the right image that the fine search meets."""
+    """The columns of the right image that the fine search reads."""
     return Near(ratio=4 // FINE_PX, reach=max_disparity_px // FINE_PX, margin=REACH + 2)
 
 
@@ -41,10 +41,10 @@ def rims(d: Tensor) -> Tensor:
 
 
 class Refined(NamedTuple):
-    """An answer at 1/4, and what it takes to bring it to full size."""
+    """A disparity at 1/4, with the features that upsample it to full size."""
 
     disparity: Tensor  # [B, 1, H/4, W/4] px
-    doubt: Tensor  # likewise: a logarithm of sigma, up to scale and bounds
+    doubt: Tensor  # [B, 1, H/4, W/4]: a logarithm of sigma, up to scale and bounds
     features: Tensor  # [B, C, H/4, W/4]
 
 
@@ -92,9 +92,9 @@ class Refinement(nn.Module):
         cost = lookup(pairs, position(surfaces))
         wide = box3(cost)
         apart = squash(torch.cat((surfaces[:, 1:], carried), dim=1) - plain, 2.0)
-        told = torch.cat((cost, wide, apart, beyond(surfaces, scale=4)), dim=1)
-        x = F.relu(joint(self.first, context, told) + enlarge(self.hidden(hidden)))
-        # Where an object ends shows in a wider view than 3x3 cells.
+        measured = torch.cat((cost, wide, apart, beyond(surfaces, scale=4)), dim=1)
+        x = F.relu(joint(self.first, context, measured) + enlarge(self.hidden(hidden)))
+        # The outline of an object shows only in a wider window than 3x3 cells.
         low = F.relu6(self.lower(F.relu6(self.low(F.relu6(self.down(x))))))
         x = F.relu(x + enlarge(self.back(low)))
         fixed = cost * self.sharpness[0] + wide * self.sharpness[1]
@@ -110,13 +110,13 @@ class Refinement(nn.Module):
         offset = expected(self.subpixel * smooth, tap_px[:, None, None])
         d = d + offset
         step = carried - d
-        # Interpolated entries flatten a peak between two of them: tell where between them it lies.
+        # Interpolation flattens a peak between two entries: the place between them is an input.
         phase = (looked_at - torch.floor(looked_at)).detach()
         steps = squash(torch.cat((step, offset), dim=1), 0.5)
         fitted = (taps, smooth, steps, apart[:, :2], phase, hole)
         x = F.relu(joint(self.second, x, torch.cat(fitted, dim=1)))
         out = self.out(x)
-        # The previous frame's surface is evidence too, while it agrees: half of a small step.
+        # While the previous frame's surface agrees, move towards it: at first half of a small step.
         keep = torch.sigmoid(4 * out[:, 1:2]) * torch.exp(-step.abs()) * (1 - hole)
         d = (d + keep * step + 2 * out[:, :1]).clamp(min=MIN_PX)
         return Refined(d, out[:, 2:], x), hypotheses

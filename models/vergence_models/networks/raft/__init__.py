@@ -1,1 +1,1 @@
-"""The `full` and `fast` tiers: RAFT-Stereo's realtime network, carried through time by a warp."""
+"""The `full` and `fast` tiers: the networks of the paper, after RAFT-Stereo."""

@@ -1,4 +1,4 @@
-"""What the images say: features of both to match, and the left one's context at 1/8 and 1/16.
+"""Features of both images for matching, and context of the left image at 1/8 and 1/16.
 
 One trunk for all three, as in RAFT-Stereo's realtime network (Lipson, Teed, Deng; 3DV 2021).
 """
@@ -78,7 +78,7 @@ class ContextHead(nn.Module):
 
 
 class Encoding(NamedTuple):
-    """What a pair says before any iteration."""
+    """The features of a pair, before any iteration."""
 
     left: Tensor  # [B, C, H/8, W/8], to match
     right: Tensor  # the same shape

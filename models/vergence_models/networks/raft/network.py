@@ -1,8 +1,8 @@
 """The network of `full` and `fast`, after "Stereo Matching in Time" (Cheng, Yang, Li; WACV 2024).
 
-RAFT-Stereo's realtime network, whose iterations go on over frames: disparity and both hidden states
-of the previous frame are moved to the new view and take one iteration more. Where the warp brings
-nothing, and on a cold start, both start from the context of the new image.
+RAFT-Stereo's realtime network, with iterations that continue over frames: disparity and both hidden
+states of the previous frame are warped to the new view and take one more iteration. Cells without a
+warped state, and cold starts, begin from the context of the new image.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from vergence_models.networks.losses import doubt_loss, known, lookup_cross_entr
 from vergence_models.networks.raft.encoder import Encoder
 from vergence_models.networks.raft.update import (
     CELL_PX,
-    ConvexUpsampler,
+    RaftUpsampler,
     Update,
     correlation,
     pyramid,
@@ -29,12 +29,12 @@ from vergence_models.networks.raft.update import (
 from vergence_models.networks.warp import splat_levels
 from vergence_proto.model_io import StateTensor
 
-MIN_PX = 0.1  # no answer is nearer to infinity
-TYPICAL_PX = 16.0  # where the first guess starts
+MIN_PX = 0.1  # the smallest disparity of a result
+TYPICAL_PX = 16.0  # the first disparity of an untrained network
 
 
 class RaftState(NamedTuple):
-    """What one step hands to the next."""
+    """The recurrent state."""
 
     disparity: Tensor  # float32 [B, 1, H/8, W/8], full-resolution pixels, 0 = nothing known
     hidden8: Tensor  # float32 [B, C, H/8, W/8]
@@ -42,7 +42,7 @@ class RaftState(NamedTuple):
 
 
 class RaftGiven(NamedTuple):
-    """What one frame's iterations have in common."""
+    """The inputs that all iterations of a frame share."""
 
     pairs: Tensor  # [B, H/8, W/8, W/8]: correlation of left and right cells
     gates8: Tensor  # [B, 3 C, H/8, W/8]
@@ -51,16 +51,17 @@ class RaftGiven(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RaftEstimate(Estimate):
-    """The answer, and the guesses on the way to it."""
+    """The estimate, and the inner estimates before it."""
 
     pairs: Tensor  # [B, H/8, W/8, W/8]: correlation of left and right cells
-    first: Tensor  # [B, 1, H/8, W/8] px: what the context alone says
+    first: Tensor  # [B, 1, H/8, W/8] px: predicted from the context alone
     eighths: list[Tensor]  # [B, 1, H/8, W/8] px: after each iteration
 
     def loss(self, truth_px: Tensor, max_disparity_px: int) -> Tensor:
-        """L1 of the answer as in the paper; less for what led to it, later iterations weigh more.
+        """L1 of the result as in the paper, plus smaller losses of the inner estimates.
 
-        The cross-entropy of the correlation teaches the features before any iteration can.
+        Later iterations weigh more. The cross-entropy of the correlation teaches the features
+        before any iteration can.
         """
         mask = known(truth_px, max_disparity_px)
         error = (self.disparity - truth_px).abs()
@@ -88,7 +89,7 @@ class RaftNetwork(StereoNetwork[RaftNetworkConfig]):
             silent(nn.Conv2d(config.head, 1, 3, padding=1)),
         )
         self.update = Update(config)
-        self.upsample = ConvexUpsampler(config)
+        self.upsample = RaftUpsampler(config)
 
     @property
     def state_tensors(self) -> tuple[StateTensor, ...]:
@@ -100,7 +101,7 @@ class RaftNetwork(StereoNetwork[RaftNetworkConfig]):
         )
 
     def carried(self, state: RaftState, uvd_curr_from_prev: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Disparity and hidden states as the new view sees them, each with where it is known."""
+        """Disparity and hidden states in the new view, each with a mask of its known cells."""
         disparity, *hidden = state
         if self.config.warp:
             return splat_levels(disparity, tuple(hidden), uvd_curr_from_prev, scale=CELL_PX)
@@ -111,7 +112,7 @@ class RaftNetwork(StereoNetwork[RaftNetworkConfig]):
     def begin(
         self, left: Tensor, right: Tensor, uvd_curr_from_prev: Tensor, state: RaftState
     ) -> tuple[Tensor, RaftGiven, RaftState]:
-        """Before the iterations: the context's guess, what they are given, where they start."""
+        """The part before the iterations: first disparity, shared inputs, starting state."""
         encoding = self.encoder(left, right)
         given = RaftGiven(correlation(encoding.left, encoding.right), *encoding.gates)
         # Twice itself or half of it is one step of the same size.
@@ -131,7 +132,7 @@ class RaftNetwork(StereoNetwork[RaftNetworkConfig]):
         return RaftState(d, hidden8, hidden16)
 
     def end(self, moving: RaftState) -> tuple[Tensor, Tensor, RaftState]:
-        """After the iterations: disparity and sigma at full size, and the next state."""
+        """The part after the iterations: disparity and sigma at full size, and the next state."""
         d, hidden8, hidden16 = moving
         disparity, sigma = self.upsample(hidden8, d)
         following = RaftState(d.clamp(min=MIN_PX), hidden8, hidden16)

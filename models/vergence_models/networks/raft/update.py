@@ -15,7 +15,7 @@ from vergence_models.config import RaftNetworkConfig
 from vergence_models.networks.cost_volume import lookup_row, whole_rows
 from vergence_models.networks.layers import all_pairs, silent
 
-CELL_PX = 8  # of the matched features
+CELL_PX = 8  # size of a cell of the matched features
 LEVELS = 4
 REACH = 4  # entries looked up on either side, at every level
 
@@ -49,7 +49,7 @@ def right_column(d: Tensor) -> Tensor:
 
 
 class MotionEncoder(nn.Module):
-    """What the lookup and the disparity itself tell the cell."""
+    """Encodes the looked-up correlation and the disparity as inputs of the cell."""
 
     def __init__(self, config: RaftNetworkConfig) -> None:
         super().__init__()
@@ -75,7 +75,7 @@ class MotionEncoder(nn.Module):
 
 
 class ContextGru(nn.Module):
-    """A convolutional GRU whose gates hear a context that is the same in every iteration."""
+    """A convolutional GRU; a context that is the same in every iteration biases its gates."""
 
     def __init__(self, hidden: int, inputs: int) -> None:
         super().__init__()
@@ -93,7 +93,7 @@ class ContextGru(nn.Module):
 
 
 class Update(nn.Module):
-    """One iteration of both levels; the coarse one, being cheap, goes twice (slow-fast)."""
+    """One iteration of both levels; the coarse level is cheap and runs twice (slow-fast)."""
 
     def __init__(self, config: RaftNetworkConfig) -> None:
         super().__init__()
@@ -119,7 +119,7 @@ class Update(nn.Module):
         pooled = F.avg_pool2d(hidden8, 2)
         for _ in range(2):
             hidden16 = self.cell16(hidden16, gates[1], pooled)
-        # What this iteration starts from is given: it learns from its own answer alone.
+        # No gradient flows to the start of an iteration: it learns from its own result alone.
         d = d.detach()
         motion = self.motion(d, looked_up(levels, d))
         wide = F.interpolate(hidden16, scale_factor=2.0, mode="bilinear")
@@ -127,7 +127,7 @@ class Update(nn.Module):
         return (hidden8, hidden16), d + self.head(hidden8) * CELL_PX
 
 
-class ConvexUpsampler(nn.Module):
+class RaftUpsampler(nn.Module):
     """Disparity at full size, each pixel a convex combination of the nine cells round it; sigma."""
 
     def __init__(self, config: RaftNetworkConfig) -> None:

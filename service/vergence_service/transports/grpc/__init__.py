@@ -1,0 +1,1 @@
+"""``vergence.v1.DepthService`` over gRPC. Read ``server``, then ``errors``."""

@@ -1,4 +1,4 @@
-"""DepthError to gRPC: a status, and google.rpc.ErrorInfo for programs."""
+"""Translate DepthError to gRPC: a status, with google.rpc.ErrorInfo for programs."""
 
 import logging
 from collections.abc import AsyncIterator, Mapping
@@ -13,7 +13,7 @@ from vergence_proto.errors import DepthError, ErrorCode, ModelFailed
 
 log = logging.getLogger(__name__)
 
-# Requests and responses differ from call to call; nothing here looks at them.
+# Requests and responses have a different type in each call; nothing here reads them.
 Context = grpc.aio.ServicerContext[Any, Any]
 
 GRPC_STATUS: Mapping[ErrorCode, grpc.StatusCode] = {
@@ -54,7 +54,7 @@ async def abort(context: Context, error: DepthError) -> None:
 
 @asynccontextmanager
 async def errors_as_status(context: Context) -> AsyncIterator[None]:
-    """End the call with whatever DepthError the block raises; anything else is told as INTERNAL."""
+    """End the call with the DepthError that the block raises; report other errors as INTERNAL."""
     try:
         yield
     except DepthError as error:
@@ -62,5 +62,5 @@ async def errors_as_status(context: Context) -> AsyncIterator[None]:
     except (grpc.aio.AbortError, grpc.aio.UsageError):
         raise
     except Exception:
-        log.exception("a call failed in a way that nobody foresaw")
-        await abort(context, ModelFailed("the server failed; its log says why"))
+        log.exception("a call failed with an unexpected error")
+        await abort(context, ModelFailed("the server failed; its log has the reason"))

@@ -12,7 +12,7 @@ from grpc_reflection.v1alpha import reflection
 from vergence_proto.errors import BadShape
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.v1 import depth_pb2_grpc
-from vergence_service.transports.addresses import place
+from vergence_service.transports.addresses import format_address
 from vergence_service.transports.errors import PortTaken
 from vergence_service.transports.grpc.errors import Context, errors_as_status
 from vergence_service.transports.open_calls import OpenCalls
@@ -20,11 +20,11 @@ from vergence_service.transports.unary import UnaryMethods
 
 _SERVICE = pb.DESCRIPTOR.services_by_name["DepthService"].full_name
 
-# A frame just over the limit is still received, so that the refusal can say what the limit is.
+# A frame just above the limit is still received, so that the error can name the limit.
 _ROOM_OVER_THE_LIMIT = 1.25
 
-# A headset that vanished is noticed within fifteen seconds, not gRPC's two hours; clients may ask
-# as often as every five.
+# A client that vanished is noticed within 15 s instead of gRPC's two hours. Clients may ping every
+# 5 s.
 _KEEPALIVE = (
     ("grpc.keepalive_time_ms", 10_000),
     ("grpc.keepalive_timeout_ms", 5_000),
@@ -40,17 +40,17 @@ async def _messages(
         async for request in requests:
             yield request
     except DecodeError:
-        raise BadShape("expected messages of vergence.v1, got bytes that are none") from None
+        raise BadShape("expected messages of vergence.v1, got other bytes") from None
 
 
 def _host_of(peer: str) -> str:
-    """The address in gRPC's ``ipv4:HOST:PORT``, ``ipv6:%5BHOST%5D:PORT`` or ``unix:PATH``."""
-    _, _, place_of_client = unquote(peer).partition(":")
-    return place_of_client.rpartition(":")[0].strip("[]")
+    """Return the host in gRPC's ``ipv4:HOST:PORT``, ``ipv6:%5BHOST%5D:PORT`` or ``unix:PATH``."""
+    _, _, address = unquote(peer).partition(":")
+    return address.rpartition(":")[0].strip("[]")
 
 
 class DepthServicer(depth_pb2_grpc.DepthServiceServicer):
-    """Translates each call to the engine's words."""
+    """Translates each call to a call of the engine."""
 
     def __init__(self, unary: UnaryMethods, calls: OpenCalls) -> None:
         self._unary = unary
@@ -90,16 +90,16 @@ class DepthServicer(depth_pb2_grpc.DepthServiceServicer):
 
 
 class GrpcServer:
-    """Listens from construction of its context to its end; serves once told to.
+    """Listens as long as its context lasts. Clients see it as healthy after :meth:`serving`.
 
-    Raises PortTaken.
+    Entering the context raises PortTaken if the server cannot listen on the address.
     """
 
     def __init__(
         self, servicer: DepthServicer, *, host: str, port: int, max_frame_bytes: int
     ) -> None:
         self._servicer = servicer
-        self._address = place(host, port)
+        self._address = format_address(host, port)
         self._max_message_bytes = int(max_frame_bytes * _ROOM_OVER_THE_LIMIT)
         self._health = health.aio.HealthServicer()  # type: ignore[attr-defined] # bound at import
         self.port = port
@@ -114,14 +114,12 @@ class GrpcServer:
                 *_KEEPALIVE,
             ]
         )
-        depth_pb2_grpc.add_DepthServiceServicer_to_server(  # type: ignore[no-untyped-call]
-            self._servicer, self._server
-        )
+        depth_pb2_grpc.add_DepthServiceServicer_to_server(self._servicer, self._server)
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
         reflection.enable_server_reflection(
             [_SERVICE, health.SERVICE_NAME, reflection.SERVICE_NAME], self._server
         )
-        await self._tell_health(health_pb2.HealthCheckResponse.NOT_SERVING)
+        await self._set_health(health_pb2.HealthCheckResponse.NOT_SERVING)
         try:
             self.port = self._server.add_insecure_port(self._address)
         except RuntimeError:
@@ -133,15 +131,15 @@ class GrpcServer:
         await self._server.stop(grace=None)
 
     async def serving(self) -> None:
-        """Tell those that watch the health service that calls are welcome."""
-        await self._tell_health(health_pb2.HealthCheckResponse.SERVING)
+        """Report SERVING in the health service."""
+        await self._set_health(health_pb2.HealthCheckResponse.SERVING)
 
     async def drain(self, *, within_s: float) -> None:
-        """Let calls end by themselves, then answer what they have sent and end them."""
-        await self._tell_health(health_pb2.HealthCheckResponse.NOT_SERVING)
+        """Wait until all calls end; after ``within_s``, answer what they have sent and end them."""
+        await self._set_health(health_pb2.HealthCheckResponse.NOT_SERVING)
         await self._servicer.calls.drain(within_s=within_s)
         await self._server.stop(grace=within_s)
 
-    async def _tell_health(self, status: health_pb2.HealthCheckResponse.ServingStatus) -> None:
+    async def _set_health(self, status: health_pb2.HealthCheckResponse.ServingStatus) -> None:
         for service in ("", _SERVICE):
             await self._health.set(service, status)

@@ -1,4 +1,4 @@
-"""The HTTP face: sequences and pairs, and for those who look after the server its health."""
+"""The HTTP application and its server: sequences, pairs, streams, health and metrics."""
 
 import asyncio
 import socket
@@ -19,11 +19,11 @@ from vergence_service.transports.open_calls import OpenCalls
 
 _ABOUT = """Disparity of whole stereo sequences, as a job, and of single pairs.
 
-Live streams go over gRPC (`vergence.v1.DepthService`). Whatever is refused is answered with problem
-details (RFC 9457), whose `reason` is the one that gRPC gives.
+Live streams use gRPC (`vergence.v1.DepthService`). An error is answered with problem details
+(RFC 9457); `reason` is the same code as over gRPC.
 """
-# What is left of an answer that is being sent when the server stops.
-_LAST_WORDS_S = 5
+# Time to finish the answers that are being sent when the server stops.
+_FINISH_S = 5
 
 
 def make_http_app(
@@ -33,6 +33,7 @@ def make_http_app(
     registry: CollectorRegistry,
     routes: Sequence[APIRouter],
 ) -> FastAPI:
+    """Make the application from its routes."""
     app = FastAPI(title="Vergence", version=version, description=_ABOUT, redoc_url=None)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign] # as FastAPI documents it
     install_problems(app)
@@ -46,12 +47,12 @@ def _health_routes(ready: Callable[[], bool], registry: CollectorRegistry) -> AP
 
     @router.get("/healthz")
     async def alive() -> dict[str, str]:
-        """The process answers."""
+        """Check that the process answers."""
         return {"status": "alive"}
 
-    @router.get("/readyz", responses={503: {"description": "New streams are not taken"}})
+    @router.get("/readyz", responses={503: {"description": "New streams are not accepted"}})
     async def readiness(response: Response) -> dict[str, str]:
-        """New streams are taken: 503 while the model loads and while the server drains."""
+        """Check for readiness: 503 while the model loads and while the server drains."""
         if not ready():
             response.status_code = 503
         return {"status": "ready" if ready() else "not ready"}
@@ -62,14 +63,14 @@ def _health_routes(ready: Callable[[], bool], registry: CollectorRegistry) -> AP
         responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
     )
     async def metrics() -> Response:
-        """What the server counts, for Prometheus."""
+        """Get the metrics, in the format of Prometheus."""
         return Response(generate_latest(registry), media_type=CONTENT_TYPE_LATEST)
 
     return router
 
 
 def _openapi(app: FastAPI) -> dict[str, Any]:
-    """FastAPI's, and the schemas that it does not find by itself: of problems and of forms."""
+    """Return FastAPI's schema, with the schemas of problems and forms that it does not find."""
     if app.openapi_schema is None:
         schema = get_openapi(
             title=app.title, version=app.version, description=app.description, routes=app.routes
@@ -84,7 +85,7 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
 
 
 class _Uvicorn(uvicorn.Server):
-    """Leaves the signals to whoever runs the process."""
+    """A uvicorn server that does not handle signals: the process does."""
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -92,9 +93,10 @@ class _Uvicorn(uvicorn.Server):
 
 
 class HttpServer:
-    """Serves the app from the start of its context to its end. Raises PortTaken.
+    """Serves the app as long as its context lasts.
 
-    ``stopping`` is set before it waits for the answers that are being sent, and ``calls`` end.
+    At the end, it sets ``stopping``, ends ``calls``, and waits for the answers that are being sent.
+    Entering the context raises PortTaken if the server cannot listen on the address.
     """
 
     def __init__(
@@ -118,7 +120,7 @@ class HttpServer:
             log_config=None,
             access_log=False,
             lifespan="off",
-            timeout_graceful_shutdown=_LAST_WORDS_S,
+            timeout_graceful_shutdown=_FINISH_S,
         )
         self._server = _Uvicorn(config)
         self._task = asyncio.create_task(self._server.serve([self._socket]), name="http")
@@ -132,5 +134,5 @@ class HttpServer:
         self._socket.close()
 
     async def drain(self, *, within_s: float) -> None:
-        """Let calls end by themselves; after that, answer what they have sent and end them."""
+        """Wait until all calls end; after ``within_s``, answer what they have sent and end them."""
         await self._calls.drain(within_s=within_s)

@@ -1,4 +1,4 @@
-"""DepthError to HTTP: a status, and problem details (RFC 9457) with the reason that gRPC gives."""
+"""Translate DepthError to HTTP: a status, and problem details (RFC 9457) with gRPC's reason."""
 
 import http
 import logging
@@ -47,17 +47,17 @@ HTTP_STATUS: Mapping[ErrorCode, int] = {
 
 
 class Problem(BaseModel):
-    """Why a request was refused."""
+    """The reason why a request was refused."""
 
     title: str
     status: int
-    detail: str = Field(description="what was expected, what came, what to do")
+    detail: str = Field(description="what was expected, what was received, what to do next")
     reason: ErrorCode | None = Field(
         default=None, description="the same as google.rpc.ErrorInfo.reason over gRPC"
     )
 
 
-# Every operation answers so when it does not answer as it says.
+# The answer of every operation to an error.
 PROBLEM_RESPONSE: dict[int | str, dict[str, Any]] = {
     "default": {
         "description": "A problem",
@@ -67,7 +67,7 @@ PROBLEM_RESPONSE: dict[int | str, dict[str, Any]] = {
                 "example": {
                     "title": "Not Found",
                     "status": 404,
-                    "detail": "no sequence '5f0c': it never was, was deleted, or its result "
+                    "detail": "no sequence '5f0c': it never existed, was deleted, or its result "
                     "expired, 24 h after its end or when disk space ran short",
                     "reason": "SEQUENCE_UNKNOWN",
                 },
@@ -78,6 +78,7 @@ PROBLEM_RESPONSE: dict[int | str, dict[str, Any]] = {
 
 
 def problem_of(error: DepthError) -> Problem:
+    """Translate an error to problem details."""
     status = HTTP_STATUS[error.code]
     return Problem(
         title=http.HTTPStatus(status).phrase, status=status, detail=str(error), reason=error.code
@@ -85,7 +86,7 @@ def problem_of(error: DepthError) -> Problem:
 
 
 def install_problems(app: FastAPI) -> None:
-    """Whatever goes wrong in ``app`` is told as a problem."""
+    """Answer every error in ``app`` with problem details."""
 
     @app.exception_handler(DepthError)
     async def _refused(request: Request, error: DepthError) -> JSONResponse:
@@ -93,10 +94,10 @@ def install_problems(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def _invalid(request: Request, error: RequestValidationError) -> JSONResponse:
-        told = "; ".join(
+        problems = "; ".join(
             f"{'.'.join(map(str, each['loc']))}: {each['msg']}" for each in error.errors()
         )
-        return _response(problem_of(BadShape(told)))
+        return _response(problem_of(BadShape(problems)))
 
     @app.exception_handler(HTTPException)
     async def _http(request: Request, error: HTTPException) -> JSONResponse:
@@ -106,8 +107,8 @@ def install_problems(app: FastAPI) -> None:
 
     @app.exception_handler(Exception)
     async def _unforeseen(request: Request, error: Exception) -> JSONResponse:
-        log.error("a request failed in a way that nobody foresaw", exc_info=error)
-        return _response(problem_of(ModelFailed("the server failed; its log says why")))
+        log.error("a request failed with an unexpected error", exc_info=error)
+        return _response(problem_of(ModelFailed("the server failed; its log has the reason")))
 
 
 def _response(

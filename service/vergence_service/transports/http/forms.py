@@ -1,4 +1,4 @@
-"""multipart/form-data to files on disk, part by part, as it comes in."""
+"""Write multipart/form-data to files on disk, part by part, as it arrives."""
 
 from dataclasses import dataclass
 from io import BufferedWriter
@@ -11,19 +11,21 @@ from vergence_proto.errors import BadSequence
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class FormPart:
+    """One part of a form, in a file."""
+
     name: str
     path: Path
 
 
 class FormWriter:
-    """Writes each part to a file in ``folder``. Raises BadSequence."""
+    """Writes each part to a file in ``folder``. All methods raise BadSequence on a bad form."""
 
     def __init__(self, content_type: str, folder: Path, *, max_parts: int) -> None:
         boundary = parse_options_header(content_type)[1].get(b"boundary")
         if not boundary:
             raise BadSequence("expected a boundary in the content type of multipart/form-data")
-        self.parts: list[Part] = []
+        self.parts: list[FormPart] = []
         self._folder = folder
         self._max_parts = max_parts
         self._header_name = bytearray()
@@ -48,18 +50,20 @@ class FormWriter:
             raise BadSequence(f"expected multipart/form-data: {error}") from None
 
     def write(self, data: bytes) -> None:
+        """Parse the next bytes of the form."""
         try:
             self._parser.write(data)
         except FormParserError as error:
             raise BadSequence(f"expected multipart/form-data: {error}") from None
 
-    def finish(self) -> list[Part]:
-        """All parts, in order. Raises BadSequence: the form was cut short."""
+    def finish(self) -> list[FormPart]:
+        """Return all parts, in order. Raises BadSequence if the form was cut off."""
         if not self._complete:
-            raise BadSequence("the form is cut short: its last boundary is missing")
+            raise BadSequence("the form is cut off: its last boundary is missing")
         return self.parts
 
     def close(self) -> None:
+        """Close the file of the current part."""
         if self._file is not None:
             self._file.close()
             self._file = None
@@ -80,8 +84,8 @@ class FormWriter:
             raise BadSequence(f"expected at most {self._max_parts} parts in the form")
         options = parse_options_header(self._headers.pop(b"content-disposition", b""))[1]
         self._headers.clear()
-        path = self._folder / f"{len(self.parts):06d}"  # never by a name that the client chose
-        self.parts.append(Part(options.get(b"name", b"").decode("utf-8", "replace"), path))
+        path = self._folder / f"{len(self.parts):06d}"  # never a name that the client chose
+        self.parts.append(FormPart(options.get(b"name", b"").decode("utf-8", "replace"), path))
         self._file = path.open("wb")
 
     def _on_part_data(self, data: bytes, start: int, end: int) -> None:

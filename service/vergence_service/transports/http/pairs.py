@@ -1,4 +1,4 @@
-"""POST /v1/pairs: two images up, disparity down; curl is enough."""
+"""The route of /v1/pairs: upload two images, download disparity. curl is enough."""
 
 import asyncio
 import io
@@ -11,13 +11,13 @@ import numpy as np
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from vergence_proto.datasets import LayoutError, encode_disparity_png, read_image
+from vergence_proto.datasets import DatasetError, encode_disparity_png, read_image
 from vergence_proto.errors import BadCalibration, BadImage, BadShape, FrameTooLarge
 from vergence_proto.geometry import RectifiedRig
 from vergence_proto.types import Delivery, Image, Plane, StereoFrame, StereoRig
 from vergence_service.jobs.upload_checks import check_file
 from vergence_service.streams.engine import DepthEngine
-from vergence_service.streams.stream import Opening
+from vergence_service.streams.stream import StreamConfig
 from vergence_service.transports.http.errors import PROBLEM_RESPONSE
 from vergence_service.transports.http.uploads import (
     FORM_TYPE,
@@ -28,23 +28,30 @@ from vergence_service.transports.http.uploads import (
 
 
 class PairFormat(StrEnum):
-    PNG16 = "png16"  # x256, 0 = none, as KITTI does
-    NPY = "npy"  # float32, NaN = none
+    """The file format of the answer."""
+
+    PNG16 = "png16"  # value times 256, 0 where there is no value (the KITTI convention)
+    NPY = "npy"  # float32, NaN where there is no value
 
 
 class PairOutput(StrEnum):
+    """The kind of map in the answer."""
+
     DISPARITY = "disparity"
     DEPTH = "depth"
 
 
 class PairQuery(BaseModel):
+    """The options of a request."""
+
     model_config = ConfigDict(extra="forbid")
 
     format: PairFormat = PairFormat.PNG16
     output: PairOutput = Field(
-        default=PairOutput.DISPARITY, description="depth, in metres, needs fx_px and baseline_m"
+        default=PairOutput.DISPARITY,
+        description="depth is in metres and needs fx_px and baseline_m",
     )
-    iterations: int = Field(default=0, ge=0, le=64, description="0: those of a cold start")
+    iterations: int = Field(default=0, ge=0, le=64, description="0: as many as a cold start")
     fx_px: float | None = Field(default=None, ge=1, le=1e6)
     baseline_m: float | None = Field(default=None, ge=1e-4, le=1e3)
 
@@ -67,24 +74,25 @@ _BODY: dict[str, Any] = {
 }
 _ANSWER: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "16-bit PNG (x256, 0 = none) or float32 NPY",
+        "description": "16-bit PNG (value times 256, 0: no value) or float32 NPY (NaN: no value)",
         "content": {"image/png": {"schema": _FILE}, "application/octet-stream": {"schema": _FILE}},
     }
 }
 
 
 def pair_routes(engine: DepthEngine, *, limits: UploadLimits) -> APIRouter:
+    """Make the route."""
     router = APIRouter(tags=["pairs"], responses=PROBLEM_RESPONSE)
 
     @router.post("/v1/pairs", response_class=Response, responses=_ANSWER, openapi_extra=_BODY)
     async def step_pair(request: Request, query: Annotated[PairQuery, Query()]) -> Response:
-        """Disparity of one rectified pair, stepped cold, without a stream.
+        """Compute the disparity of one rectified pair, without a stream.
 
         `curl -F left=@left.png -F right=@right.png HOST/v1/pairs -o disparity.png`
         """
         left, right = await _images(request, limits, max_pixels=engine.max_pixels)
         height, width = left.shape[:2]
-        nominal_px = float(width)  # disparity is the same for every focal length
+        nominal_px = float(width)  # any focal length gives the same disparity
         rig = RectifiedRig(
             width=width,
             height=height,
@@ -96,15 +104,17 @@ def pair_routes(engine: DepthEngine, *, limits: UploadLimits) -> APIRouter:
             baseline_m=query.baseline_m or 1.0,
         )
         if query.output is PairOutput.DEPTH and not (query.fx_px and query.baseline_m):
-            raise BadCalibration("depth needs fx_px and baseline_m; without them take disparity")
-        opening = Opening(
+            raise BadCalibration(
+                "depth needs fx_px and baseline_m; without them, ask for disparity"
+            )
+        config = StreamConfig(
             StereoRig.from_rectified(rig),
             delivery=Delivery.EVERY,
             cold_iterations=query.iterations,
         )
-        stream = await engine.open_apart(opening)
+        stream = await engine.open_offline(config)
         frame = StereoFrame(1, 0, left, right)
-        disparity, _ = await engine.step_apart(stream, lambda: frame)
+        disparity, _ = await engine.step_offline(stream, lambda: frame)
         wanted = disparity.depth_m if query.output is PairOutput.DEPTH else disparity.disparity_px
         return await asyncio.to_thread(_encoded, wanted, query.format)
 
@@ -128,7 +138,7 @@ async def _images(
     left, right = images["left"], images["right"]
     if left.shape != right.shape:
         raise BadShape(
-            f"both images must have one size, got left {left.shape[1]}x{left.shape[0]} and right "
+            f"expected two images of one size, got left {left.shape[1]}x{left.shape[0]} and right "
             f"{right.shape[1]}x{right.shape[0]}"
         )
     return left, right
@@ -140,7 +150,7 @@ def _image(path: Path, name: str, max_pixels: int) -> Image:
         return read_image(path)
     except FrameTooLarge as error:
         raise FrameTooLarge(f"{name} image: {error}") from None
-    except (BadImage, LayoutError) as error:
+    except (BadImage, DatasetError) as error:
         raise BadImage(f"{name} image: {str(error).removeprefix(f'{path}: ')}") from None
 
 

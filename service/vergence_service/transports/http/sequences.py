@@ -1,9 +1,10 @@
-"""/v1/sequences: a whole sequence up, a job, its progress, its result."""
+"""The routes of /v1/sequences: submit a sequence, follow its job, download its result."""
 
 import asyncio
 from collections.abc import AsyncGenerator, AsyncIterator, Iterator
 from contextlib import aclosing
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
@@ -12,8 +13,10 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from vergence_proto.errors import BadShape, ErrorCode, NotReady, UnknownSequence
 from vergence_proto.jobs import JobState, Output, ResultFormat
-from vergence_service.jobs.job import JobOptions
-from vergence_service.jobs.queue import JobQueue, JobStatus
+from vergence_service.jobs.job import Job, JobOptions
+from vergence_service.jobs.progress import JobStatus
+from vergence_service.jobs.queue import JobQueue
+from vergence_service.jobs.registry import JobRegistry
 from vergence_service.jobs.results import CannotEncode, mp4_of, zip_of
 from vergence_service.transports.http.errors import PROBLEM_RESPONSE
 from vergence_service.transports.http.uploads import (
@@ -24,9 +27,9 @@ from vergence_service.transports.http.uploads import (
     receive_sequence,
 )
 
-_FILM_FPS = 30.0  # of a source that does not state its own
-_TELL_EVERY_S = 0.25
-# A proxy between closes connections that are silent for longer.
+_FILM_FPS = 30.0  # frame rate of a film whose sequence does not state one
+_POLL_EVERY_S = 0.25
+# Proxies close connections that are silent for longer than about this.
 _SILENCE_S = 15.0
 
 _EXAMPLE: dict[str, JsonValue] = {
@@ -49,21 +52,27 @@ _EXAMPLE: dict[str, JsonValue] = {
 
 
 class SubmitQuery(BaseModel):
-    """How a sequence is to be stepped, and what is wanted of it."""
+    """The options of a submission."""
 
     model_config = ConfigDict(extra="forbid")
 
     source: str | None = Field(
         default=None,
-        description="KIND:PATH in the archive, as vergence:room or kitti:sequences/00; needed "
-        "where it holds several",
+        description="the sequence as KIND:PATH in the archive, for example vergence:room or "
+        "kitti:sequences/00; needed if the archive contains several",
     )
-    model: str | None = Field(default=None, description="refuse unless the server runs this one")
-    iterations: int = Field(default=0, ge=0, le=64, description="of every step; 0: the default")
-    output: list[Output] = Field(default=[Output.DISPARITY], description="of every frame")
-    metrics: bool = Field(default=False, description="compare with the truth in the archive")
-    wait: bool = Field(default=False, description="answer with the result when it is done")
-    format: ResultFormat = Field(default=ResultFormat.PNG16, description="of the awaited result")
+    model: str | None = Field(default=None, description="refuse unless the server runs this model")
+    iterations: int = Field(
+        default=0, ge=0, le=64, description="iterations of every step; 0: the default"
+    )
+    output: list[Output] = Field(
+        default=[Output.DISPARITY], description="maps to keep for every frame"
+    )
+    metrics: bool = Field(default=False, description="compare with the ground truth in the archive")
+    wait: bool = Field(default=False, description="answer with the result, when the job is done")
+    format: ResultFormat = Field(
+        default=ResultFormat.PNG16, description="format of the awaited result"
+    )
 
 
 class ResultQuery(BaseModel):
@@ -80,17 +89,17 @@ class SequenceJob(BaseModel):
     id: str
     state: JobState
     created: datetime
-    source: str = Field(description="what is stepped, KIND:PATH in the upload")
+    source: str = Field(description="the sequence as KIND:PATH in the upload")
     frames: int
     frames_done: int
-    ahead: int = Field(description="sequences that run before it")
+    ahead: int = Field(description="sequences that run before this one")
     fps: float | None
-    eta_s: float | None = Field(description="of its own frames")
+    eta_s: float | None = Field(description="seconds that its remaining frames need")
     output: list[Output]
     iterations: int
     metrics: bool
-    accuracy: dict[str, float] | None = Field(description="the mean over frames with truth")
-    reason: ErrorCode | None = Field(description="why it failed")
+    accuracy: dict[str, float] | None = Field(description="mean over the frames with ground truth")
+    reason: ErrorCode | None = Field(description="code of the failure")
     message: str | None
 
     @classmethod
@@ -125,7 +134,7 @@ _UPLOAD: dict[str, Any] = {
             FORM_TYPE: {
                 "schema": {
                     "type": "object",
-                    "description": "either archive alone, or the other three",
+                    "description": "either `archive` alone, or the other three",
                     "properties": {
                         "archive": _FILE,
                         "left": {"type": "array", "items": _FILE},
@@ -139,19 +148,23 @@ _UPLOAD: dict[str, Any] = {
 }
 _RESULT: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "A zip with a file a frame; with format=mp4 a film",
+        "description": "A zip with one file per frame and output; with format=mp4 a film",
         "content": {"application/zip": _BINARY, "video/mp4": _BINARY},
     }
 }
 _ACCEPTED: dict[int | str, dict[str, Any]] = {
-    202: {"model": SequenceJob, "description": "Accepted: it will be done, come what may"}
+    202: {
+        "model": SequenceJob,
+        "description": "Accepted: a crash or restart of the server does not lose it",
+    }
 }
 
 
 def sequence_routes(
     queue: JobQueue, *, model: str, limits: UploadLimits, stopping: asyncio.Event
 ) -> APIRouter:
-    """``stopping`` ends what would otherwise keep a connection open while the server stops."""
+    """Make the routes. ``stopping`` ends the answers that wait for a job while the server stops."""
+    jobs = queue.jobs
     router = APIRouter(tags=["sequences"], responses=PROBLEM_RESPONSE)
 
     @router.post(
@@ -167,22 +180,22 @@ def sequence_routes(
         `curl --data-binary @room.zip -H 'content-type: application/zip' HOST/v1/sequences`
         """
         if query.model not in (None, model):
-            raise BadShape(f"expected model {model}, which this server runs, got {query.model!r}")
+            raise BadShape(f"expected {model}, the model of this server, got {query.model!r}")
         options = JobOptions(
             iterations=query.iterations,
             outputs=tuple(dict.fromkeys(query.output)),
             metrics=query.metrics,
         )
         client = client_of(request)
-        async with queue.place(client) as folder:
+        async with queue.reserve_slot(client) as folder:
             await receive_sequence(request, folder, limits)
             status = await queue.accept(folder, query.source, options, client=client)
         job_id = status.job.job_id
         if query.wait:
-            while not (status := queue.status(job_id)).job.ended and not stopping.is_set():
-                await queue.change(within_s=_TELL_EVERY_S)
+            while not (status := jobs.status(job_id)).job.ended and not stopping.is_set():
+                await jobs.change(within_s=_POLL_EVERY_S)
             if status.job.ended:
-                return await _result(queue, job_id, query.format)
+                return await _result(jobs, job_id, query.format)
         return JSONResponse(
             SequenceJob.of(status).model_dump(mode="json"),
             status_code=202,
@@ -191,29 +204,29 @@ def sequence_routes(
 
     @router.get("/v1/sequences")
     async def list_sequences() -> list[SequenceJob]:
-        """Every job that the server knows, oldest first."""
-        return [SequenceJob.of(status) for status in queue.statuses()]
+        """List all jobs, oldest first."""
+        return [SequenceJob.of(status) for status in jobs.statuses()]
 
     @router.get("/v1/sequences/{job_id}")
     async def get_sequence(job_id: str) -> SequenceJob:
-        """How far a job is."""
-        return SequenceJob.of(queue.status(job_id))
+        """Get the state and the progress of a job."""
+        return SequenceJob.of(jobs.status(job_id))
 
     @router.get(
         "/v1/sequences/{job_id}/events",
         response_class=StreamingResponse,
         responses={
             200: {
-                "description": "Server-sent events: `progress` with the job, until it has ended",
+                "description": "Server-sent events: `progress` with the job, until it ends",
                 "content": {"text/event-stream": {"schema": {"type": "string"}}},
             }
         },
     )
     async def events(job_id: str) -> StreamingResponse:
-        """Progress, as it is made."""
-        queue.status(job_id)
+        """Follow the progress of a job."""
+        jobs.status(job_id)
         return StreamingResponse(
-            _events(queue, job_id, stopping),
+            _events(jobs, job_id, stopping),
             media_type="text/event-stream",
             headers={"Cache-Control": "no-store"},
         )
@@ -222,54 +235,54 @@ def sequence_routes(
         "/v1/sequences/{job_id}/result", response_class=StreamingResponse, responses=_RESULT
     )
     async def result(job_id: str, query: Annotated[ResultQuery, Query()]) -> Response:
-        """What came of every frame, made while it is sent."""
-        return await _result(queue, job_id, query.format)
+        """Download the result. It is encoded while it is sent."""
+        return await _result(jobs, job_id, query.format)
 
     @router.delete("/v1/sequences/{job_id}", status_code=204)
     async def delete(job_id: str) -> None:
-        """Cancel the job if it has not ended, and remove all that it has."""
+        """Cancel the job if it has not ended, and delete all its files."""
         await queue.delete(job_id)
 
     return router
 
 
 def no_sequence_routes(why: str) -> APIRouter:
-    """In place of :func:`sequence_routes` where jobs cannot be kept."""
+    """Make the routes that replace :func:`sequence_routes` if jobs cannot be kept on disk."""
     router = APIRouter(include_in_schema=False)
 
     @router.api_route("/v1/sequences{rest:path}", methods=["DELETE", "GET", "POST"])
     async def refuse(rest: str) -> None:
-        raise NotReady(f"this server takes no sequences: {why}")
+        raise NotReady(f"this server accepts no sequences: {why}")
 
     return router
 
 
-async def _events(queue: JobQueue, job_id: str, stopping: asyncio.Event) -> AsyncIterator[str]:
+async def _events(jobs: JobRegistry, job_id: str, stopping: asyncio.Event) -> AsyncIterator[str]:
     loop = asyncio.get_running_loop()
-    told: JobStatus | None = None
+    reported: JobStatus | None = None
     spoken_s = loop.time()
     while not stopping.is_set():
         try:
-            status = queue.status(job_id)
+            status = jobs.status(job_id)
         except UnknownSequence:
             yield "event: deleted\ndata: {}\n\n"
             return
-        if status != told:
-            told, spoken_s = status, loop.time()
+        if status != reported:
+            reported, spoken_s = status, loop.time()
             yield f"event: progress\ndata: {SequenceJob.of(status).model_dump_json()}\n\n"
         elif loop.time() - spoken_s > _SILENCE_S:
             spoken_s = loop.time()
             yield ": still here\n\n"
         if status.job.ended:
             return
-        await queue.change(within_s=_TELL_EVERY_S)
+        await jobs.change(within_s=_POLL_EVERY_S)
 
 
-async def _result(queue: JobQueue, job_id: str, form: ResultFormat) -> Response:
-    job, _ = queue.result(job_id)
-    pieces = _pieces(queue, job_id, form)
+async def _result(jobs: JobRegistry, job_id: str, form: ResultFormat) -> Response:
+    job, folder = jobs.result(job_id)
+    pieces = _pieces(jobs, job, folder, form)
     try:
-        first = await anext(pieces)  # what cannot be encoded is told before the answer begins
+        first = await anext(pieces)  # an error of the encoder must come before the answer begins
     except CannotEncode as error:
         raise BadShape(f"format {form}: {error}") from None
     film = form is ResultFormat.MP4
@@ -288,13 +301,14 @@ async def _chained(first: bytes, rest: AsyncGenerator[bytes, None]) -> AsyncIter
             yield piece
 
 
-async def _pieces(queue: JobQueue, job_id: str, form: ResultFormat) -> AsyncGenerator[bytes, None]:
-    job, folder = queue.result(job_id)
+async def _pieces(
+    jobs: JobRegistry, job: Job, folder: Path, form: ResultFormat
+) -> AsyncGenerator[bytes, None]:
     pieces: Iterator[bytes]
     if form is ResultFormat.MP4:
         pieces = mp4_of(folder, fps=job.source_fps or _FILM_FPS)
     else:
         pieces = zip_of(folder, form, job.options.outputs)
-    with queue.reading(job_id):
+    with jobs.reading(job.job_id):
         while (piece := await asyncio.to_thread(next, pieces, None)) is not None:
             yield piece

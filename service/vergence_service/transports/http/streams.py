@@ -1,4 +1,7 @@
-"""Live streams over HTTP, for networks that let nothing else through: see http_records."""
+"""The routes of live streams over HTTP, for networks that block gRPC.
+
+:mod:`vergence_proto.http_records` defines the format.
+"""
 
 import asyncio
 import secrets
@@ -33,6 +36,7 @@ _BODY: dict[str, Any] = {
 
 
 def stream_routes(calls: OpenCalls, unary: UnaryMethods) -> APIRouter:
+    """Make the routes."""
     router = APIRouter(tags=["streams"], responses=PROBLEM_RESPONSE)
     open_calls: dict[str, _HttpCall] = {}
     methods: dict[str, _Method] = {
@@ -49,7 +53,7 @@ def stream_routes(calls: OpenCalls, unary: UnaryMethods) -> APIRouter:
         responses={200: {"content": {RECORDS_TYPE: {"schema": {"type": "string"}}}}},
     )
     async def open_stream(request: Request) -> StreamingResponse:
-        """Open or resume a stream with a StreamDepthRequest; its answers come as records."""
+        """Open or resume a stream with a StreamDepthRequest. The answers come as records."""
         call = _HttpCall(calls, client=client_of(request))
         first = await call.begin(await _message(request, pb.StreamDepthRequest, calls))
         open_calls[call.call_id] = call
@@ -69,14 +73,14 @@ def stream_routes(calls: OpenCalls, unary: UnaryMethods) -> APIRouter:
 
     @router.post("/v1/streams/{call_id}", status_code=204, openapi_extra=_BODY)
     async def send(call_id: str, request: Request) -> None:
-        """One StreamDepthRequest to an open call; waits while the call takes no more."""
+        """Send one StreamDepthRequest to an open call. Waits while the call accepts no more."""
         if call_id not in open_calls:
-            raise UnknownStream("no open call of this id; open or resume the stream")
+            raise UnknownStream("no open call has this id; open or resume the stream")
         call = open_calls[call_id]
         try:
             await call.put(await _message(request, pb.StreamDepthRequest, calls))
         except DepthError as error:
-            call.end(error)  # what was in the message would never be answered
+            call.end(error)  # the client would wait for an answer to this message for ever
             raise
 
     @router.post(
@@ -86,9 +90,10 @@ def stream_routes(calls: OpenCalls, unary: UnaryMethods) -> APIRouter:
         responses={200: {"content": {PROTOBUF_TYPE: {"schema": {"type": "string"}}}}},
     )
     async def ask(
-        request: Request, method: str = Path(description="as in depth.proto, GetServerInfo")
+        request: Request,
+        method: str = Path(description="a name in depth.proto, for example GetServerInfo"),
     ) -> Response:
-        """The methods of DepthService that are one question and one answer."""
+        """Call a unary method of DepthService."""
         if method not in methods:
             raise BadShape(f"expected one of {', '.join(methods)}, got {method[:64]!r}")
         answer = await methods[method](request, calls)
@@ -104,15 +109,15 @@ class _HttpCall:
         self.call_id = secrets.token_urlsafe(16)
         self._client = client
         self._calls = calls
-        # One of each: whoever is ahead waits for the other, as on a connection that is full.
+        # Room for one each: the faster side waits for the slower, as on a full connection.
         self._incoming: asyncio.Queue[pb.StreamDepthRequest] = asyncio.Queue(1)
         self._outgoing: asyncio.Queue[bytes] = asyncio.Queue(1)
         self._ended = asyncio.Event()
         self._opened = False
-        self._refusal: DepthError | None = None  # of the opening
+        self._refusal: DepthError | None = None  # the error of the opening
 
     async def begin(self, opening: pb.StreamDepthRequest) -> bytes:
-        """Start the call; the first record of its answer. Raises the error of the opening."""
+        """Start the call; return the first record of its answer. Raises the opening's error."""
         self._call = self._calls.make(self._requests(opening), self._write, client=self._client)
         self._task = asyncio.create_task(self._run(), name="HTTP call")
         first = await self._outgoing.get()
@@ -137,7 +142,7 @@ class _HttpCall:
             yield await self._outgoing.get()
 
     async def leave(self) -> None:
-        """The client is gone, or has all: the stream waits for its next attachment."""
+        """End the call: the client is gone or has every answer. The stream may be resumed."""
         self._task.cancel()
         await asyncio.gather(self._task, return_exceptions=True)
 
@@ -146,15 +151,15 @@ class _HttpCall:
         try:
             await self._calls.run(self._call)
         except DepthError as error:
-            end = self._told(error)
+            end = self._end_record(error)
         except Exception as error:
-            log.error("a call failed in a way that nobody foresaw", exc_info=error)
-            end = self._told(ModelFailed("the server failed; its log says why"))
-        # Not in a finally: a call that was cancelled has nobody to tell.
+            log.error("a call failed with an unexpected error", exc_info=error)
+            end = self._end_record(ModelFailed("the server failed; its log has the reason"))
+        # Not in a ``finally``: if the call was cancelled, no client is left to report to.
         await self._outgoing.put(pack_record(RecordKind.END, end))
         self._ended.set()
 
-    def _told(self, error: DepthError) -> bytes:
+    def _end_record(self, error: DepthError) -> bytes:
         if not self._opened:
             self._refusal = error
         return codec.error_to_frame_error(0, error).SerializeToString()
@@ -182,12 +187,15 @@ def _method(question: type[Any], answer: Callable[[Any], Coroutine[Any, Any, Mes
 
 
 async def _message(request: Request, kind: type[Any], calls: OpenCalls) -> Any:
-    """The body as a message of ``kind``. Raises FrameTooLarge, BadShape."""
+    """Read the body as a message of ``kind``.
+
+    Raises FrameTooLarge if it is too long, and BadShape if it is another message.
+    """
     limit = calls.limits.max_frame_bytes
     body = bytearray()
     async for chunk in request.stream():
         body += chunk
-        if len(body) > limit + 4096:  # what is round a frame
+        if len(body) > limit + 4096:  # room for the fields beside the images
             raise FrameTooLarge(f"expected a message of at most {limit} bytes")
     try:
         return kind.FromString(bytes(body))

@@ -1,7 +1,7 @@
-"""What clients upload, received on disk: an archive, or the images and the calibration of a form.
+"""Receive uploads on disk: an archive, or a form with images and a calibration.
 
-Bytes are counted as they come and never held in memory. Whatever is refused or breaks off leaves
-nothing behind but the folder that it was received in, which is the caller's to remove.
+Bytes are counted as they arrive and are never all in memory. An upload that is refused or aborted
+leaves files only in the folder that the caller provides and removes.
 """
 
 import asyncio
@@ -17,7 +17,7 @@ from starlette.requests import ClientDisconnect
 
 from vergence_proto.errors import BadSequence, UploadTooLarge
 from vergence_service.jobs.archives import ArchiveLimits, unpack
-from vergence_service.transports.http.forms import FormWriter, Part
+from vergence_service.transports.http.forms import FormPart, FormWriter
 
 FORM_TYPE = "multipart/form-data"
 ARCHIVE_TYPES = (
@@ -36,13 +36,15 @@ _EXTENSIONS = {b"\x89PNG": "png", b"\xff\xd8\xff": "jpg", b"RIFF": "webp"}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UploadLimits:
+    """The limits of one upload."""
+
     max_bytes: int
-    idle_s: float  # without a byte, until the upload is given up
+    idle_s: float  # abort an upload that sends nothing for this long
     archive: ArchiveLimits
 
 
 class Calibration(BaseModel):
-    """A rectified rig, as in calib.json; lengths in pixels and metres."""
+    """A rectified rig, as in calib.json, in pixels and metres."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -58,28 +60,34 @@ class Calibration(BaseModel):
 
 
 class SequenceForm(BaseModel):
-    """What goes with the images of a form."""
+    """The calibration and the poses of the images of a form."""
 
     model_config = ConfigDict(extra="forbid")
 
     calibration: Calibration
     poses: list[Annotated[list[FiniteFloat], Field(min_length=12, max_length=12)]] | None = Field(
         default=None,
-        description="of each frame, 3x4 camera-to-world row by row: left camera, OpenCV axes, m",
+        description="pose of each frame: 3x4 camera-to-world matrix, row by row; left camera, "
+        "OpenCV axes, metres",
     )
 
 
 def client_of(request: Request) -> str:
-    """The address that a request comes from."""
+    """Return the address that a request comes from."""
     return request.client.host if request.client else ""
 
 
 def media_type(request: Request) -> str:
+    """Return the media type of a body, without parameters."""
     return request.headers.get("content-type", "").partition(";")[0].strip().lower()
 
 
 async def receive_sequence(request: Request, folder: Path, limits: UploadLimits) -> None:
-    """Fill ``folder``/input from the body of a request. Raises BadSequence, UploadTooLarge."""
+    """Write the sequence in the body of a request to ``folder``/input.
+
+    Raises BadSequence if the body is not an allowed form or archive or is cut off, and
+    UploadTooLarge if it exceeds a limit.
+    """
     kind = media_type(request)
     if kind == FORM_TYPE:
         parts = await receive_form(request, folder, limits)
@@ -96,8 +104,11 @@ async def receive_sequence(request: Request, folder: Path, limits: UploadLimits)
         )
 
 
-async def receive_form(request: Request, folder: Path, limits: UploadLimits) -> list[Part]:
-    """Every part of the form as a file in ``folder``. Raises BadSequence, UploadTooLarge."""
+async def receive_form(request: Request, folder: Path, limits: UploadLimits) -> list[FormPart]:
+    """Write every part of a form to a file in ``folder``.
+
+    Raises BadSequence if the form is damaged or cut off, and UploadTooLarge if it is too large.
+    """
     parts = folder / "parts"
     await asyncio.to_thread(parts.mkdir)
     writer = FormWriter(request.headers["content-type"], parts, max_parts=limits.archive.max_files)
@@ -123,7 +134,7 @@ async def _chunks(request: Request, limits: UploadLimits) -> AsyncIterator[bytes
             raise BadSequence(
                 f"the upload stopped for {limits.idle_s:g} s after {received} bytes"
             ) from None
-        except ClientDisconnect:  # nobody will read this but the log of whoever wraps the client
+        except ClientDisconnect:  # the client is gone; only a proxy may still log this error
             raise BadSequence(f"the upload broke off after {received} bytes") from None
         if chunk is None:
             return
@@ -140,7 +151,7 @@ def _unpacked(archive: Path, folder: Path, limits: UploadLimits) -> None:
     archive.unlink()
 
 
-def _sequence_of_parts(parts: Sequence[Part], folder: Path, limits: UploadLimits) -> None:
+def _sequence_of_parts(parts: Sequence[FormPart], folder: Path, limits: UploadLimits) -> None:
     by_name: dict[str, list[Path]] = {}
     for part in parts:
         by_name.setdefault(part.name, []).append(part.path)
@@ -161,14 +172,14 @@ def _sequence_of_parts(parts: Sequence[Part], folder: Path, limits: UploadLimits
 def _write_layout(
     target: Path, left: Sequence[Path], right: Sequence[Path], sequence: Path
 ) -> None:
-    """As a folder of the project's own layout."""
+    """Write a folder in the project's own layout."""
     form = _sequence_form(sequence)
     counts = {"left": len(left), "right": len(right)}
     if form.poses is not None:
         counts["poses"] = len(form.poses)
     if len(set(counts.values())) > 1:
-        told = ", ".join(f"{count} {name}" for name, count in counts.items())
-        raise BadSequence(f"expected as many of each, got {told}")
+        found = ", ".join(f"{count} {name}" for name, count in counts.items())
+        raise BadSequence(f"expected as many of each, got {found}")
     target.mkdir()
     calibration = form.calibration.model_dump(exclude_none=True)
     (target / "calib.json").write_text(json.dumps(calibration), "utf-8")
@@ -186,10 +197,10 @@ def _sequence_form(path: Path) -> SequenceForm:
     try:
         return SequenceForm.model_validate_json(path.read_bytes())
     except ValidationError as error:
-        told = "; ".join(
+        problems = "; ".join(
             f"{'.'.join(map(str, each['loc']))}: {each['msg']}" for each in error.errors()
         )
-        raise BadSequence(f"the JSON 'sequence': {told}") from None
+        raise BadSequence(f"the JSON 'sequence': {problems}") from None
 
 
 def _extension(image: Path) -> str:

@@ -1,0 +1,1 @@
+"""``vergence.v1`` over Zenoh. Read ``server``, then ``call`` and ``errors``."""

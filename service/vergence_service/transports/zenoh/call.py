@@ -1,4 +1,4 @@
-"""One attachment to a stream over Zenoh: a StreamDepth call made of keys."""
+"""One StreamDepth call over Zenoh: the keys of one stream instead of a connection."""
 
 from collections.abc import AsyncIterator
 
@@ -9,23 +9,23 @@ from google.rpc import status_pb2
 from vergence_proto.errors import Quota
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.zenoh.inbox import Inbox
-from vergence_proto.zenoh.keys import OPEN, StreamKeys, ask_key
-from vergence_proto.zenoh.session import Undeclarable, ZenohPeer
+from vergence_proto.zenoh.keys import OPEN, StreamKeys, query_key
+from vergence_proto.zenoh.session import Declaration, ZenohSession
 from vergence_service.transports.open_calls import OpenCalls
 from vergence_service.transports.zenoh.errors import status_of
 
 
 class ZenohCall:
-    """Translates between the keys of one stream and a DepthCall. Made in answer to an open query.
+    """Translates between the keys of one stream and a DepthCall. An open query creates it.
 
-    A live frame, and the answer to one, is dropped where the way is full rather than kept until it
-    is old. The call finds which frames were lost by the gaps in their ids and answers them as
-    dropped, and every pong says which are still to be answered, so that no credit is lost.
+    Where the network is full, live frames and their answers are dropped instead of delayed. The
+    call finds lost frames by the gaps in their ids and answers them as dropped. Every pong lists
+    the frames that still wait for an answer. So no credit is lost.
     """
 
     def __init__(
         self,
-        peer: ZenohPeer,
+        peer: ZenohSession,
         query: zenoh.Query,
         opening: pb.OpenStream,
         *,
@@ -34,7 +34,7 @@ class ZenohCall:
         calls: OpenCalls,
     ) -> None:
         self._peer = peer
-        self._query: zenoh.Query | None = query  # until it is answered
+        self._query: zenoh.Query | None = query  # None after its answer
         self._opening = opening
         self._namespace = namespace
         self._attachment_id = attachment_id
@@ -44,15 +44,15 @@ class ZenohCall:
         self._inbox = Inbox(
             attachment_id,
             bulky=pb.Frame,
-            room=1 if self._live else calls.limits.credit,
-            displaces=self._live,
+            max_bulky=1 if self._live else calls.limits.credit,
+            drop_oldest=self._live,
         )
-        self._subscription: Undeclarable | None = None
+        self._subscription: Declaration | None = None
         self._unanswered: set[int] = set()  # frame ids
         self._last_frame_id: int | None = None
 
     async def run(self) -> None:
-        """Serve the call to its end, and tell the client how it ended."""
+        """Serve the call to its end, and report the end to the client."""
         end: Message = pb.End()
         try:
             await self._calls.run(self._call)
@@ -88,9 +88,9 @@ class ZenohCall:
     async def _note(self, frame_id: int) -> None:
         last = self._last_frame_id
         if last is not None:
-            # A client has no more than its credit unanswered, so no more can be missing.
+            # At most ``credit`` frames of a client wait for an answer, so no more can be missing.
             oldest = max(last + 1, frame_id - self._calls.limits.credit)
-            await self._call.tell_lost(range(oldest, frame_id))
+            await self._call.report_lost(range(oldest, frame_id))
         self._last_frame_id = frame_id
         self._unanswered.add(frame_id)
 
@@ -114,12 +114,12 @@ class ZenohCall:
                 await self._send(self._keys.status, response)
 
     async def _accept(self, opened: pb.StreamOpened) -> None:
-        """Answer the query, ready for the frames that follow at once."""
+        """Answer the query. Frames may follow at once, so subscribe to them first."""
         self._keys = StreamKeys(self._namespace, opened.stream_id)
         self._subscription = await self._peer.subscribe(self._keys.frames, self._inbox.put)
         query, self._query = self._query, None
         assert query is not None
-        await self._peer.reply(query, ask_key(self._namespace, self._peer.id, OPEN), opened)
+        await self._peer.reply(query, query_key(self._namespace, self._peer.id, OPEN), opened)
 
     async def _send(self, key: str, message: Message) -> None:
         await self._peer.put(key, message, attachment_id=self._attachment_id, may_drop=self._live)

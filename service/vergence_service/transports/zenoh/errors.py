@@ -1,4 +1,4 @@
-"""Errors to google.rpc.Status, the payload of whatever fails over Zenoh."""
+"""Translate errors to google.rpc.Status, the payload of every error over Zenoh."""
 
 import logging
 
@@ -12,8 +12,8 @@ log = logging.getLogger(__name__)
 
 
 def status_of(error: Exception) -> status_pb2.Status:
-    """The status of a DepthError; anything else is logged, and told as INTERNAL."""
+    """Return the status of a DepthError; log any other error and report it as INTERNAL."""
     if not isinstance(error, DepthError):
-        log.error("a call failed in a way that nobody foresaw", exc_info=error)
-        error = ModelFailed("the server failed; its log says why")
+        log.error("a call failed with an unexpected error", exc_info=error)
+        error = ModelFailed("the server failed; its log has the reason")
     return codec.error_to_status(error, GRPC_STATUS[error.code].value[0])

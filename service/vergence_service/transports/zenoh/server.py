@@ -1,4 +1,4 @@
-"""vergence.v1 over Zenoh: queries to ask and to open, keys to stream, tokens to see who lives."""
+"""``vergence.v1`` over Zenoh: queries for methods, keys for streams, tokens for liveliness."""
 
 import asyncio
 import logging
@@ -11,8 +11,8 @@ from google.protobuf.message import DecodeError, Message
 
 from vergence_proto.errors import BadShape
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_proto.zenoh.keys import ANY, OPEN, UNARY_KEYS, StreamKeys, ask_key, server_key
-from vergence_proto.zenoh.session import ZenohPeer, make_config, reason_of
+from vergence_proto.zenoh.keys import ANY, OPEN, UNARY_KEYS, StreamKeys, query_key, server_key
+from vergence_proto.zenoh.session import ZenohSession, make_config, reason_of
 from vergence_service.transports.errors import ZenohUnreachable
 from vergence_service.transports.open_calls import OpenCalls
 from vergence_service.transports.unary import UnaryMethods
@@ -21,7 +21,7 @@ from vergence_service.transports.zenoh.errors import status_of
 
 log = logging.getLogger(__name__)
 
-# A frame just over the limit is still received, so that the refusal can say what the limit is.
+# A frame just above the limit is still received, so that the error can name the limit.
 _ROOM_OVER_THE_LIMIT = 1.25
 
 Question = TypeVar("Question", bound=Message)
@@ -35,7 +35,10 @@ def zenoh_config(
     connect: Sequence[str],
     max_frame_bytes: int,
 ) -> zenoh.Config:
-    """A file says all but the bound on messages. Raises ZenohUnreachable: it is not one."""
+    """Make the configuration, from a file or from mode and endpoints.
+
+    Raises ZenohUnreachable if it is not a configuration.
+    """
     bound = int(max_frame_bytes * _ROOM_OVER_THE_LIMIT)
     try:
         if file is not None:
@@ -51,9 +54,9 @@ def zenoh_config(
 
 
 class ZenohServer:
-    """On the network from the start of its context to its end; serves once told to.
+    """Is on the network as long as its context lasts. It answers after :meth:`serving`.
 
-    Raises ZenohUnreachable.
+    Entering the context raises ZenohUnreachable if the network cannot be joined.
     """
 
     def __init__(
@@ -61,7 +64,7 @@ class ZenohServer:
     ) -> None:
         self._calls = calls
         self._namespace = namespace
-        self._peer = ZenohPeer(config)
+        self._peer = ZenohSession(config)
         self._methods: Mapping[str, tuple[type[Message], Callable[[Any], Awaitable[Message]]]] = {
             UNARY_KEYS["GetServerInfo"]: (pb.GetServerInfoRequest, unary.server_info),
             UNARY_KEYS["GetStream"]: (pb.GetStreamRequest, unary.stream),
@@ -85,18 +88,18 @@ class ZenohServer:
         await self._peer.close()
 
     async def serving(self) -> None:
-        """Answer, and tell those on the network that this server lives."""
+        """Answer queries, and declare this server alive on the network."""
         peer, namespace = self._peer, self._namespace
         client_keys = StreamKeys(namespace, ANY).client(ANY)
-        # Held for as long as this server serves: Zenoh ends what nobody refers to.
+        # Kept as long as this server serves: Zenoh removes declarations without references.
         self._declared = [
-            await peer.watch_deaths(client_keys, self._client_died),
-            await peer.answer_queries(ask_key(namespace, peer.id, ANY), self._asked),
-            await peer.declare_alive(server_key(namespace, peer.id)),
+            await peer.watch_liveliness(client_keys, self._client_died),
+            await peer.answer_queries(query_key(namespace, peer.id, ANY), self._asked),
+            await peer.declare_liveliness(server_key(namespace, peer.id)),
         ]
 
     async def drain(self, *, within_s: float) -> None:
-        """Let calls end by themselves, then answer what they have sent and end them."""
+        """Wait until all calls end; after ``within_s``, answer what they have sent and end them."""
         await self._calls.drain(within_s=within_s)
         if self._tasks:
             await asyncio.wait(self._tasks, timeout=within_s)
@@ -110,20 +113,20 @@ class ZenohServer:
             query.attachment.to_bytes().decode(errors="replace") if query.attachment else ""
         )
         if not attachment_id or attachment_id in self._attached:
-            error = BadShape("expected an attachment id of its own with each opening")
+            error = BadShape("expected a new attachment id with each open query")
             self._start(self._peer.refuse(query, status_of(error)))
             return
         task = self._start(self._open(query, attachment_id))
-        # At once, so that a death that comes next finds it.
+        # At once, so that the end of the client, if it comes next, finds the call.
         self._attached[attachment_id] = task
         task.add_done_callback(lambda _: self._attached.pop(attachment_id))
 
     def _client_died(self, key: str) -> None:
         if task := self._attached.get(key.rpartition("/")[2]):
-            task.cancel()  # its stream is detached, and kept for the grace
+            task.cancel()  # its stream is detached and kept for detach_grace_s
 
     async def _open(self, query: zenoh.Query, attachment_id: str) -> None:
-        with query:  # dropped at the latest when the call has ended
+        with query:  # Zenoh ends the query at the latest when the call ends
             try:
                 opening = _read(query, pb.OpenStream)
             except BadShape as error:
@@ -148,7 +151,7 @@ class ZenohServer:
         except Exception as error:
             await self._peer.refuse(query, status_of(error))
         else:
-            await self._peer.reply(query, ask_key(self._namespace, self._peer.id, what), answer)
+            await self._peer.reply(query, query_key(self._namespace, self._peer.id, what), answer)
 
     def _start(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         task = asyncio.create_task(work)
@@ -163,7 +166,7 @@ class ZenohServer:
 
 
 def _read(query: zenoh.Query, kind: type[Question]) -> Question:
-    """Raises BadShape."""
+    """Read the payload of a query. Raises BadShape if it is not a message of ``kind``."""
     try:
         return kind.FromString(query.payload.to_bytes() if query.payload else b"")
     except DecodeError:

@@ -1,7 +1,7 @@
 """Parametric furniture. Each maker builds one thing on a bench.
 
 The thing stands on the floor (y = 0, up is -y) around the origin, its front towards -z, and all
-of it lies within the footprint that `Plan` gave it.
+of it lies within the footprint that `FloorPlan` gave it.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from collections.abc import Callable
 import numpy as np
 
 from vergence_models.data.xrbench import meshes
-from vergence_models.data.xrbench.palette import Palette
+from vergence_models.data.xrbench.palette import SurfacePalette
 from vergence_models.data.xrbench.things import Finish, Workbench
 
-Maker = Callable[[Workbench, Palette, np.random.Generator], None]
+Maker = Callable[[Workbench, SurfacePalette, np.random.Generator], None]
 
 
-def table(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
+def table(b: Workbench, p: SurfacePalette, rng: np.random.Generator) -> None:
     """Four legs, or one below a round top; now and then the top is glass."""
     half_x, half_z = rng.uniform(0.45, 0.8), rng.uniform(0.35, 0.5)
     height = rng.uniform(0.68, 0.78)
@@ -33,7 +33,7 @@ def table(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
     set_out(b, p, rng, half_x * 0.7, half_z * 0.6, -height - 0.016, count=int(rng.integers(2, 6)))
 
 
-def coffee_table(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
+def coffee_table(b: Workbench, p: SurfacePalette, rng: np.random.Generator) -> None:
     half_x, half_z, height = rng.uniform(0.35, 0.6), rng.uniform(0.25, 0.35), 0.4
     wood = p.wood()
     b.box(wood, (0, -height, 0), (half_x, 0.02, half_z))
@@ -42,7 +42,7 @@ def coffee_table(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
     set_out(b, p, rng, half_x * 0.7, half_z * 0.6, -height - 0.02, count=int(rng.integers(1, 4)))
 
 
-def chair(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
+def chair(b: Workbench, p: SurfacePalette, rng: np.random.Generator) -> None:
     """Its back is made of slats or of thin rods."""
     wood, half, height = p.wood(), rng.uniform(0.19, 0.24), 0.45
     back = height + rng.uniform(0.4, 0.55)
@@ -62,7 +62,7 @@ def chair(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
             b.rods(wood, 0.006, ends)
 
 
-def sofa(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
+def sofa(b: Workbench, p: SurfacePalette, rng: np.random.Generator) -> None:
     fabric, half_x, half_z = p.fabric(), rng.uniform(0.7, 1.05), 0.42
     b.box(fabric, (0, -0.2, 0), (half_x, 0.12, half_z))
     seats = 2 if half_x < 0.85 else 3
@@ -79,7 +79,7 @@ def sofa(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
     b.legs(p.wood(), half_x - 0.08, half_z - 0.08, 0.1, 0.02)
 
 
-def bed(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
+def bed(b: Workbench, p: SurfacePalette, rng: np.random.Generator) -> None:
     half_x, wood = rng.uniform(0.5, 0.85), p.wood()
     b.box(wood, (0, -0.16, 0), (half_x, 0.1, 1.0))
     b.legs(wood, half_x - 0.05, 0.9, 0.1, 0.03)
@@ -90,7 +90,7 @@ def bed(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
         b.add(p.fabric(0.5), meshes.ball((0.3, 0.1, 0.2)), (x, -0.5, 0.68))
 
 
-def cabinet(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
+def cabinet(b: Workbench, p: SurfacePalette, rng: np.random.Generator) -> None:
     """Drawers with knobs, and things on top."""
     body, knob = p.wood(), p.metal()
     half_x, half_y, half_z = rng.uniform(0.3, 0.6), rng.uniform(0.35, 0.55), rng.uniform(0.18, 0.25)
@@ -107,7 +107,7 @@ def cabinet(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
     set_out(b, p, rng, half_x * 0.8, half_z * 0.5, -2 * half_y, count=int(rng.integers(1, 4)))
 
 
-def wardrobe(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
+def wardrobe(b: Workbench, p: SurfacePalette, rng: np.random.Generator) -> None:
     """Two doors; one may be a mirror."""
     body, half_x, half_y = p.wood(1.2), rng.uniform(0.5, 0.8), rng.uniform(0.95, 1.1)
     b.box(body, (0, -half_y, 0.02), (half_x, half_y, 0.26))
@@ -118,7 +118,7 @@ def wardrobe(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
         b.box(p.metal(), (x * 0.12, -half_y, -0.275), (0.008, 0.09, 0.012))
 
 
-def bookshelf(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
+def bookshelf(b: Workbench, p: SurfacePalette, rng: np.random.Generator) -> None:
     wood, thick = p.wood(), 0.011
     half_x, half_y, half_z = rng.uniform(0.35, 0.6), rng.uniform(0.6, 1.05), 0.14
     boards = int(rng.integers(3, 6))
@@ -143,7 +143,7 @@ def bookshelf(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
             x += 2 * half + (rng.uniform(0, 0.15) if rng.random() < 0.1 else 0.001)
 
 
-def desk(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
+def desk(b: Workbench, p: SurfacePalette, rng: np.random.Generator) -> None:
     """A desk with a display, a keyboard, a lamp on a thin arm."""
     half_x, half_z, height = rng.uniform(0.6, 0.8), 0.36, 0.73
     b.box(p.wood(), (0, -height, 0), (half_x, 0.015, half_z))
@@ -167,7 +167,7 @@ def desk(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
     set_out(b, p, rng, half_x * 0.5, 0.05, top, count=2, tall_m=0.12, front_m=-0.25)
 
 
-def office_chair(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
+def office_chair(b: Workbench, p: SurfacePalette, rng: np.random.Generator) -> None:
     fabric, dark = p.fabric(), p.plain(tone=0.05, finish=Finish.SATIN)
     b.box(fabric, (0, -0.48, -0.02), (0.24, 0.04, 0.23))
     b.box(fabric, (0, -0.85, 0.23), (0.22, 0.26, 0.03))
@@ -178,7 +178,7 @@ def office_chair(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
         b.add(dark, meshes.ball((0.028,) * 3), (foot[0], -0.028, foot[2]))
 
 
-def plant(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
+def plant(b: Workbench, p: SurfacePalette, rng: np.random.Generator) -> None:
     """A pot and bent leaves to all sides."""
     radius, green = rng.uniform(0.11, 0.17), [p.leaf() for _ in range(3)]
     b.add(p.ceramic(), meshes.lathe(
@@ -197,7 +197,7 @@ def plant(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
         b.add(green[k % 3], blade, (0, -2 * radius - stem * rng.uniform(0.2, 1.0), 0), turn=turn)
 
 
-def floor_lamp(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
+def floor_lamp(b: Workbench, p: SurfacePalette, rng: np.random.Generator) -> None:
     """A thin post with a paper shade."""
     metal, height = p.metal(), rng.uniform(1.4, 1.7)
     b.add(metal, meshes.post(0.14, 0.012), (0, -0.012, 0))
@@ -205,7 +205,7 @@ def floor_lamp(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
     b.add(p.plain(tone=0.8), meshes.lathe([(0.1, -0.14), (0.18, 0.14)]), (0, -height, 0))
 
 
-def clothes_rack(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
+def clothes_rack(b: Workbench, p: SurfacePalette, rng: np.random.Generator) -> None:
     """Thin tubes with cloth that hangs in folds."""
     metal, half, height = p.metal(), rng.uniform(0.4, 0.6), 1.5
     for x in (-half, half):
@@ -220,8 +220,8 @@ def clothes_rack(b: Workbench, p: Palette, rng: np.random.Generator) -> None:
 
 
 def set_out(
-    b: Workbench, p: Palette, rng: np.random.Generator, half_x: float, half_z: float, y_m: float,
-    *, count: int, tall_m: float = 0.35, front_m: float = 0.0,
+    b: Workbench, p: SurfacePalette, rng: np.random.Generator, half_x: float, half_z: float,
+    y_m: float, *, count: int, tall_m: float = 0.35, front_m: float = 0.0,
 ) -> None:  # fmt: skip
     """Put small things side by side on a surface at height y."""
     for x in np.linspace(-half_x, half_x, 2 * count + 1)[1::2]:
@@ -231,7 +231,7 @@ def set_out(
         b.take(one, (float(x), y_m, float(z)), yaw=float(rng.uniform(0, 6.3)))
 
 
-def trinket(b: Workbench, p: Palette, rng: np.random.Generator, tall_m: float) -> None:
+def trinket(b: Workbench, p: SurfacePalette, rng: np.random.Generator, tall_m: float) -> None:
     """A cup, a bottle, a vase, a ball, a bowl or a pile of books."""
     kind, tall = int(rng.integers(6)), min(tall_m, rng.uniform(0.08, 0.3))
     if kind == 0:

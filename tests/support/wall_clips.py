@@ -12,10 +12,11 @@ def wall_clips(count: int, *, frames: int = 3, height: int = 64, width: int = 22
     random = torch.Generator().manual_seed(7)
     disparity, step_px = 12, 6
     span = width + disparity + frames * step_px
-    texture = torch.randint(0, 256, (count, 3, height, span), generator=random, dtype=torch.uint8)
+    planes = torch.randint(0, 256, (count, 3, height, span), generator=random, dtype=torch.uint8)
+    texture = planes.permute(0, 2, 3, 1)
     starts = [k * step_px for k in range(frames)]
-    left = torch.stack([texture[..., s : s + width] for s in starts], dim=1)
-    right = torch.stack([texture[..., s + disparity :][..., :width] for s in starts], dim=1)
+    left = torch.stack([texture[:, :, s : s + width] for s in starts], dim=1)
+    right = torch.stack([texture[:, :, s + disparity :][:, :, :width] for s in starts], dim=1)
     poses = torch.eye(4, dtype=torch.float64).repeat(count, frames, 1, 1)
     baseline_m = 0.1
     poses[:, :, 0, 3] = torch.tensor(starts).double() * baseline_m / disparity

@@ -1,4 +1,4 @@
-"""The studies, each a question about the same networks, answered with a table."""
+"""The studies: each asks one question about the same networks and answers it with a table."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vergence_models.evaluation.methods import (
     with_pose_noise,
     without_poses,
 )
-from vergence_models.evaluation.metric_accumulator import Tally, settled_frame
+from vergence_models.evaluation.metric_accumulator import MetricAccumulator, settled_frame
 from vergence_models.studies import paper
 from vergence_models.studies.bench import Bench, step_times_ms
 from vergence_models.studies.findings import (
@@ -22,13 +22,13 @@ from vergence_models.studies.findings import (
     noise_findings,
     warp_findings,
 )
-from vergence_models.studies.footage import SPEEDS, Group
+from vergence_models.studies.footage import SPEEDS, FootageGroup
 from vergence_models.studies.learning import learning_curves
-from vergence_models.studies.networks import Contender
-from vergence_models.studies.tables import EPE_COLUMNS, TIME_COLUMNS, Curve, Row, Table
+from vergence_models.studies.networks import StudiedNetwork
+from vergence_models.studies.tables import EPE_COLUMNS, TIME_COLUMNS, Curve, Table, TableRow
 
-NOISE_DEG, NOISE_M = 0.3, 0.001  # of one level
-FRAMES_TOLD = (1, 2, 3, 5, 10, 15, 20, 30)
+NOISE_DEG, NOISE_M = 0.3, 0.001  # pose errors at noise level 1
+REPORTED_FRAMES = (1, 2, 3, 5, 10, 15, 20, 30)
 WARP_SPEEDS = (1, 6)
 
 Study = Callable[[Bench], Table]
@@ -37,30 +37,30 @@ Study = Callable[[Bench], Table]
 def every_method(bench: Bench) -> list[Method]:
     """The main table's: single frame and warm at every count there is, and SGBM."""
     methods = []
-    for contender in bench.contenders:
-        methods += contender.single_frame_methods() + contender.warm_methods()
+    for studied in bench.networks:
+        methods += studied.single_frame_methods() + studied.warm_methods()
     return methods + sgbm_methods()
 
 
-def one_iteration(bench: Bench) -> list[tuple[Contender, Method]]:
+def one_iteration(bench: Bench) -> list[tuple[StudiedNetwork, Method]]:
     """The paper's own way: one warm iteration a frame."""
     return [
-        (contender, contender.warm_methods()[0])
-        for contender in bench.contenders
-        if contender.warm[:1] == (1,)
+        (studied, studied.warm_methods()[0])
+        for studied in bench.networks
+        if studied.warm[:1] == (1,)
     ]
 
 
-def training_of(contenders: Sequence[Contender]) -> list[str]:
-    """Of those that have a row; a run whose every count is a graph too has none."""
-    return [each.training.words for each in contenders if each.warm or each.single_frame]
+def training_of(networks: Sequence[StudiedNetwork]) -> list[str]:
+    """The training of all networks with a row; a run whose counts all have graphs has none."""
+    return [each.training.words for each in networks if each.warm or each.single_frame]
 
 
 def times(bench: Bench) -> Table:
-    """What a frame costs."""
+    """Measure the time of a frame."""
     found = step_times_ms(every_method(bench), rounds=bench.settings.timed)
     rows = [
-        Row(label, {"ms": round(ms, 2), "fps": round(1e3 / ms, 3), "cpu_ms": round(cpu_ms, 2)})
+        TableRow(label, {"ms": round(ms, 2), "fps": round(1e3 / ms, 3), "cpu_ms": round(cpu_ms, 2)})
         for label, (ms, cpu_ms) in found.items()
     ]
     return Table(
@@ -78,7 +78,7 @@ def times(bench: Bench) -> Table:
 def main_table(bench: Bench) -> Table:
     """Every method at walking pace."""
     group = bench.clips()
-    found = bench.tallies(group, every_method(bench))
+    found = bench.accumulators(group, every_method(bench))
     return Table(
         name="main",
         title="Main table",
@@ -86,59 +86,63 @@ def main_table(bench: Bench) -> Table:
         "a 640x480 frame.",
         columns=EPE_COLUMNS | {"tepe": "TEPE"} | TIME_COLUMNS,
         rows=rows_of(found),
-        training=training_of(bench.contenders),
-        findings=main_findings(bench.contenders, found),
+        training=training_of(bench.networks),
+        findings=main_findings(bench.networks, found),
         paper=paper.MAIN,
         paper_note=paper.SOURCE,
     )
 
 
 def warp_ablation(bench: Bench) -> Table:
-    """The same network, its state moved, left where it was, and thrown away."""
+    """Compare one network with its state warped, kept in place, and discarded."""
     variants: dict[str, Method] = {}
-    for contender, warm in one_iteration(bench):
-        if contender.warps:
-            variants[f"{contender.name}, state moved"] = warm
-        variants[f"{contender.name}, state not moved"] = not_moved(contender, warm)
+    for studied, warm in one_iteration(bench):
+        if studied.warps:
+            variants[f"{studied.name}, state moved"] = warm
+        variants[f"{studied.name}, state not moved"] = not_moved(studied, warm)
         for count, method in zip(
-            contender.single_frame[-1:], contender.single_frame_methods()[-1:], strict=True
+            studied.single_frame[-1:], studied.single_frame_methods()[-1:], strict=True
         ):
-            start = counted_start(contender.network, count)
-            variants[f"{contender.name}, no state, {start}"] = method
+            start = counted_start(studied.network, count)
+            variants[f"{studied.name}, no state, {start}"] = method
     cells: dict[str, dict[str, float]] = {label: {} for label in variants}
     for speed in WARP_SPEEDS:
-        found = bench.tallies(bench.clips_at(speed), list(variants.values()))
+        found = bench.accumulators(bench.clips_at(speed), list(variants.values()))
         for label, method in variants.items():
             cells[label][f"{speed}x"] = epe(found[method.label])
     return Table(
         name="warp",
         title="Warp or no warp, at 1x and 6x",
         text=f"EPE in px on {bench.clips_at(1).words}; one warm iteration a frame. *Not moved*: "
-        "the same weights are told that the camera stands still, which leaves the state in place. "
+        "the same weights see no camera motion, which leaves the state in place. "
         "*No state*: every frame cold.",
         columns={"1x": "1x", "6x": "6x", "loss": "loss at 6x, %"},
-        rows=[Row(label, values | {"loss": loss_pct(values)}) for label, values in cells.items()],
-        training=training_of(bench.contenders),
+        rows=[
+            TableRow(label, values | {"loss": loss_pct(values)}) for label, values in cells.items()
+        ],
+        training=training_of(bench.networks),
         findings=warp_findings(cells),
-        paper=[Row(row.label, row.values | {"loss": loss_pct(row.values)}) for row in paper.SPEED],
+        paper=[
+            TableRow(row.label, row.values | {"loss": loss_pct(row.values)}) for row in paper.SPEED
+        ],
         paper_note=paper.SOURCE,
     )
 
 
-def not_moved(contender: Contender, method: Method) -> Method:
-    """The same without poses; what has no warp needs none."""
-    return method.told("state not moved", without_poses) if contender.warps else method
+def not_moved(studied: StudiedNetwork, method: Method) -> Method:
+    """The same method without poses; a network without warp ignores them anyway."""
+    return method.with_input("state not moved", without_poses) if studied.warps else method
 
 
 def movement_speed(bench: Bench) -> Table:
     """From a calm head to a violent one."""
     methods = []
-    for contender, warm in one_iteration(bench):
-        methods += [warm, not_moved(contender, warm)]
+    for studied, warm in one_iteration(bench):
+        methods += [warm, not_moved(studied, warm)]
     cells: dict[str, dict[str, float]] = {method.label: {} for method in methods}  # each once
     for speed in SPEEDS:
-        for label, tally in bench.tallies(bench.clips_at(speed), methods).items():
-            cells[label][f"{speed}x"] = epe(tally)
+        for label, accumulator in bench.accumulators(bench.clips_at(speed), methods).items():
+            cells[label][f"{speed}x"] = epe(accumulator)
     return Table(
         name="speed",
         title="Movement speed, 1x to 20x",
@@ -146,8 +150,8 @@ def movement_speed(bench: Bench) -> Table:
         "cm a second) is played back faster. What has no past is the same at every speed, and left "
         "out.",
         columns={f"{speed}x": f"{speed}x" for speed in SPEEDS},
-        rows=[Row(label, values) for label, values in cells.items()],
-        training=training_of(bench.contenders),
+        rows=[TableRow(label, values) for label, values in cells.items()],
+        training=training_of(bench.networks),
         paper=paper.SPEED,
         paper_note=paper.SOURCE,
         curves=[
@@ -161,12 +165,12 @@ def movement_speed(bench: Bench) -> Table:
 def pose_noise(bench: Bench, levels: Sequence[int] = range(11)) -> Table:
     """The tracker's errors, from none to far beyond any tracker."""
     cells: dict[str, dict[str, float]] = {}
-    for contender, warm in one_iteration(bench):
-        if not contender.warps:
+    for studied, warm in one_iteration(bench):
+        if not studied.warps:
             continue
-        told = {level: told_noise(warm, level) for level in levels}
-        found = bench.tallies(bench.clips_at(1), list(told.values()))
-        cells[warm.label] = {str(k): epe(found[method.label]) for k, method in told.items()}
+        reported = {level: with_noise_level(warm, level) for level in levels}
+        found = bench.accumulators(bench.clips_at(1), list(reported.values()))
+        cells[warm.label] = {str(k): epe(found[method.label]) for k, method in reported.items()}
     return Table(
         name="noise",
         title="Noise of the poses, levels 0 to 10",
@@ -174,8 +178,8 @@ def pose_noise(bench: Bench, levels: Sequence[int] = range(11)) -> Table:
         f"to the next is off by k x {NOISE_DEG} degrees and k x {1e3 * NOISE_M:g} mm, in random "
         "directions that are the same at each level. Networks without a warp see no poses.",
         columns={str(level): str(level) for level in levels},
-        rows=[Row(label, values) for label, values in cells.items()],
-        training=training_of(bench.contenders),
+        rows=[TableRow(label, values) for label, values in cells.items()],
+        training=training_of(bench.networks),
         findings=noise_findings(cells),
         paper_note=paper.NOISE_NOTE,
         curves=[
@@ -186,31 +190,31 @@ def pose_noise(bench: Bench, levels: Sequence[int] = range(11)) -> Table:
     )
 
 
-def told_noise(method: Method, level: int) -> Method:
+def with_noise_level(method: Method, level: int) -> Method:
     if level == 0:
         return method
-    return method.told(
+    return method.with_input(
         f"noise level {level}",
         lambda footage: with_pose_noise(footage, deg=level * NOISE_DEG, m=level * NOISE_M),
     )
 
 
 def cold_start(bench: Bench) -> Table:
-    """How long a stream takes to settle."""
+    """Measure the frames that a stream takes to settle."""
     methods = []
-    for contender, warm in one_iteration(bench):
-        methods += [warm, *contender.single_frame_methods()[-1:]]
-        if contender.cold > 1:
-            methods.append(contender.started_with(1))
+    for studied, warm in one_iteration(bench):
+        methods += [warm, *studied.single_frame_methods()[-1:]]
+        if studied.cold > 1:
+            methods.append(studied.started_with(1))
     group = bench.clips()
-    found = bench.tallies(group, methods)
-    curves = {label: tally.epe_by_frame() for label, tally in found.items()}
-    told = [frame for frame in FRAMES_TOLD if frame <= group.frames]
+    found = bench.accumulators(group, methods)
+    curves = {label: accumulator.epe_by_frame() for label, accumulator in found.items()}
+    reported = [frame for frame in REPORTED_FRAMES if frame <= group.frames]
     rows = []
     for label, epes in curves.items():
-        values = {str(frame): epes[frame - 1] for frame in told if frame <= len(epes)}
+        values = {str(frame): epes[frame - 1] for frame in reported if frame <= len(epes)}
         settled = settled_frame(epes)
-        rows.append(Row(label, values if settled is None else values | {"settled": settled}))
+        rows.append(TableRow(label, values if settled is None else values | {"settled": settled}))
     cold = ", ".join(f"{c.name} {c.cold}" for c, _ in one_iteration(bench))
     return Table(
         name="cold",
@@ -218,9 +222,9 @@ def cold_start(bench: Bench) -> Table:
         text=f"EPE in px by the number of the frame, on {group.words}. *Settled*: the first frame "
         "within 10 % of the mean over the later half. Iterations on the first frame, where a row "
         f"does not say: {cold}.",
-        columns={str(frame): str(frame) for frame in told} | {"settled": "settled by"},
+        columns={str(frame): str(frame) for frame in reported} | {"settled": "settled by"},
         rows=rows,
-        training=training_of(bench.contenders),
+        training=training_of(bench.networks),
         findings=cold_start_findings([row for row in rows if "every frame" not in row.label]),
         paper=paper.COLD_START,
         paper_note=paper.SOURCE,
@@ -238,25 +242,27 @@ def curves_of(epe_by_frame: dict[str, list[float]]) -> list[Curve]:
     ]
 
 
-def on_data(bench: Bench, group: Group, name: str) -> Table:
+def on_data(bench: Bench, group: FootageGroup, name: str) -> Table:
     """The main table on sequences or pairs from disk."""
-    found = bench.tallies(group, every_method(bench))
+    found = bench.accumulators(group, every_method(bench))
     return Table(
         name=name,
         title=f"On `{group.name}`",
         text=f"On {group.words}.",
         columns=EPE_COLUMNS | {"tepe": "TEPE", "settled": "settled by"} | TIME_COLUMNS,
         rows=rows_of(found),
-        training=training_of(bench.contenders),
-        findings=main_findings(bench.contenders, found),
-        curves=curves_of({label: tally.epe_by_frame() for label, tally in found.items()}),
+        training=training_of(bench.networks),
+        findings=main_findings(bench.networks, found),
+        curves=curves_of(
+            {label: accumulator.epe_by_frame() for label, accumulator in found.items()}
+        ),
         x_label="frame",
     )
 
 
-def kitti(bench: Bench, group: Group) -> Table:
+def kitti(bench: Bench, group: FootageGroup) -> Table:
     """The paper's protocol for KITTI odometry: EPE, and the errors that few pixels exceed."""
-    found = bench.tallies(group, every_method(bench))
+    found = bench.accumulators(group, every_method(bench))
     tail = {key: COLUMNS[key] for key in ("p99", "p97", "p95")}
     return Table(
         name="kitti",
@@ -265,22 +271,24 @@ def kitti(bench: Bench, group: Group) -> Table:
         "only so many of the pixels exceed, the 99th, 97th and 95th percentile.",
         columns={"epe": "EPE"} | tail | TIME_COLUMNS,
         rows=rows_of(found),
-        training=training_of(bench.contenders),
+        training=training_of(bench.networks),
         paper=paper.KITTI,
         paper_note=paper.SOURCE,
     )
 
 
-def rows_of(found: dict[str, Tally]) -> list[Row]:
+def rows_of(found: dict[str, MetricAccumulator]) -> list[TableRow]:
     """All figures but the times, which `times` measures on frames of one size."""
     return [
-        Row(label, {k: v for k, v in figures(tally).items() if k not in ("cpu_ms", "wall_ms")})
-        for label, tally in found.items()
+        TableRow(
+            label, {k: v for k, v in figures(accumulator).items() if k not in ("cpu_ms", "wall_ms")}
+        )
+        for label, accumulator in found.items()
     ]
 
 
-def epe(tally: Tally) -> float:
-    return tally.summary()["epe"]
+def epe(accumulator: MetricAccumulator) -> float:
+    return accumulator.summary()["epe"]
 
 
 STUDIES: dict[str, Study] = {

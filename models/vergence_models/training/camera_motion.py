@@ -27,7 +27,7 @@ def xyzw_from_uvd(clips: StereoClips) -> Tensor:
 def uvd_transforms(clips: StereoClips, world_from_left: Tensor) -> Tensor:
     """``uvd_curr_from_prev`` of every frame, float32 [B, T, 4, 4]; the first is the identity.
 
-    ``world_from_left`` float64 [B, T, 4, 4]: the clips' own poses, or others to be told instead.
+    ``world_from_left`` float64 [B, T, 4, 4]: the clips' own poses, or others in their place.
     """
     poses = world_from_left.cpu()
     curr_from_world = torch.linalg.inv(poses[:, 1:])

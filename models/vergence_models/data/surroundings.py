@@ -1,4 +1,4 @@
-"""What the settings of shots share: the viewpoint, places in view, things afloat, light.
+"""Helpers of all scenes: the viewpoint, places in view, floating objects, light.
 
 The camera stands over the world's origin and looks along z; the surroundings are turned about it.
 """
@@ -10,18 +10,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vergence_models.data.materials import Palette
-from vergence_models.data.scenes import Builder, Light, Scene, look_along
+from vergence_models.data.materials import MaterialPalette
+from vergence_models.data.scenes import Builder, PointLight, Scene, look_along
 from vergence_models.data.shapes import Cutout, Shape
 
 
 @dataclass(frozen=True, slots=True)
 class Viewpoint:
-    """What a setting needs to know of the camera."""
+    """The properties of the camera that a scene is built for."""
 
     half_angle: float  # radians from the axis to the left and right, head motion included
     aspect: float  # height / width
-    nearest_m: float  # nothing may come nearer
+    nearest_m: float  # the smallest distance of any object
     baseline_m: float
 
     @property
@@ -31,10 +31,10 @@ class Viewpoint:
 
 
 def float_about(
-    b: Builder, palette: Palette, rng: np.random.Generator, view: Viewpoint, count: int, *,
+    b: Builder, palette: MaterialPalette, rng: np.random.Generator, view: Viewpoint, count: int, *,
     far_m: float, up_m: float, moving: float, large: bool = False,
 ) -> None:  # fmt: skip
-    """Things afloat in view, some of them travelling and spinning."""
+    """Add floating objects in view, some of them moving and spinning."""
     for _ in range(count):
         near = view.nearest_m
         # Uniform in disparity, so that all disparities occur alike.
@@ -71,8 +71,9 @@ def light_color(rng: np.random.Generator, strength: float) -> NDArray[np.float64
 
 
 def compose(
-    b: Builder, rng: np.random.Generator, palette: Palette, lights: tuple[Light, Light],
-    target: NDArray[np.float64], half_angle: float, *, sky: bool = False,
+    b: Builder, rng: np.random.Generator, palette: MaterialPalette,
+    lights: tuple[PointLight, PointLight], target: NDArray[np.float64], half_angle: float, *,
+    sky: bool = False,
 ) -> Scene:  # fmt: skip
     return Scene(
         primitives=np.array(b.rows, np.float32),

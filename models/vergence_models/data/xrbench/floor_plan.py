@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vergence_models.data.xrbench import meshes
-from vergence_models.data.xrbench.furniture import Maker
-from vergence_models.data.xrbench.palette import Palette
+from vergence_models.data.xrbench.furniture_meshes import Maker
+from vergence_models.data.xrbench.palette import SurfacePalette
 from vergence_models.data.xrbench.things import Panel, Surface, Thing, Workbench, placed
 
 # A head sways less than this from where it starts, and still has arm's length to the next thing.
 _CLEARANCE_M = 0.95
 _TRIES = 40
-_THICK_M = 0.1  # of walls
+_THICK_M = 0.1  # thickness of walls
 
 
 class Wall(Enum):
@@ -27,11 +27,11 @@ class Wall(Enum):
     NEAR = np.pi
 
 
-class Plan:
+class FloorPlan:
     """A room around the origin, x in +-half_x and z in +-half_z, and what was put into it."""
 
     def __init__(
-        self, rng: np.random.Generator, palette: Palette, *, half_x: float, half_z: float,
+        self, rng: np.random.Generator, palette: SurfacePalette, *, half_x: float, half_z: float,
         height: float,
     ) -> None:  # fmt: skip
         self.half_x, self.half_z, self.height = half_x, half_z, height
@@ -98,7 +98,7 @@ class Plan:
         return bench
 
     def against(self, side: Wall, name: str, make: Maker) -> None:
-        """Build a thing and put it with its back to a wall, or leave it out if nothing is free."""
+        """Build a thing and put it with its back to a wall; omit it if no place is free."""
         bench = self._built(make)
         low, high = _bounds(bench)
         width, away = self._extent(side)
@@ -120,7 +120,7 @@ class Plan:
         return None
 
     def hang(self, side: Wall, surface: Surface, half_x: float, half_y: float, y_m: float) -> None:
-        """A picture or a mirror in a frame on a wall; left out where another one hangs."""
+        """Hang a picture or a mirror in a frame on a wall; omit it where another one hangs."""
         width, away = self._extent(side)
         bench, wood = Workbench(), self._palette.wood()
         bench.add(surface, meshes.sheet(half_x, half_y), (0, 0, -0.021))

@@ -1,4 +1,4 @@
-"""Indoor settings: furnished rooms, and close-ups of cluttered tables and floors."""
+"""Indoor scenes: furnished rooms, and close-ups of cluttered tables and floors."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vergence_models.data import furniture
-from vergence_models.data.materials import Palette
-from vergence_models.data.scenes import Builder, Light, Scene, turn_y
-from vergence_models.data.settings import Viewpoint, compose, float_about, light_color, spot
+from vergence_models.data.materials import MaterialPalette
+from vergence_models.data.scenes import Builder, PointLight, Scene, turn_y
 from vergence_models.data.shapes import Cutout
+from vergence_models.data.surroundings import Viewpoint, compose, float_about, light_color, spot
 
 
-def room(rng: np.random.Generator, palette: Palette, view: Viewpoint) -> tuple[Scene, float]:
+def room(
+    rng: np.random.Generator, palette: MaterialPalette, view: Viewpoint
+) -> tuple[Scene, float]:
     """A furnished room, and the height of the camera over its floor."""
     s = view.scale
     half = rng.uniform([1.6, 1.6], [4.5, 5.0]) * s  # x and z
@@ -57,8 +59,8 @@ def room(rng: np.random.Generator, palette: Palette, view: Viewpoint) -> tuple[S
         b_lamp.rod(lamp, (lamp[0], -height, lamp[2]), 0.008 * s, palette.plain())
     center = world_from_room @ np.zeros(3) + offset
     lights = (
-        Light(lamp + np.array([0, 0.05 * s, 0]), light_color(rng, 1.6), 3 * s),
-        Light(center + rng.normal(0, 1.5 * s, 3) * (1, 0, 1) - (0, height * 0.6, 0),
+        PointLight(lamp + np.array([0, 0.05 * s, 0]), light_color(rng, 1.6), 3 * s),
+        PointLight(center + rng.normal(0, 1.5 * s, 3) * (1, 0, 1) - (0, height * 0.6, 0),
               light_color(rng, 0.6), 3 * s),
     )  # fmt: skip
     target = lamp + np.array([0.01, 1.0, 0.02])
@@ -78,7 +80,7 @@ def _stand(
 
 
 def _shell(
-    b: Builder, palette: Palette, rng: np.random.Generator, half: NDArray[np.float64],
+    b: Builder, palette: MaterialPalette, rng: np.random.Generator, half: NDArray[np.float64],
     height: float, s: float,
 ) -> None:  # fmt: skip
     x, z = half
@@ -101,7 +103,12 @@ def _shell(
 
 
 def _hang(
-    wall: Builder, palette: Palette, rng: np.random.Generator, width: float, height: float, s: float
+    wall: Builder,
+    palette: MaterialPalette,
+    rng: np.random.Generator,
+    width: float,
+    height: float,
+    s: float,
 ) -> None:
     """Pictures, windows, doors, shelves, mirrors and curtains on a wall."""
     for _ in range(int(rng.integers(0, 5))):
@@ -135,7 +142,9 @@ def _hang(
                 wall.post(at, 0.055 * s, height * 0.45, cloth)
 
 
-def clutter(rng: np.random.Generator, palette: Palette, view: Viewpoint) -> tuple[Scene, float]:
+def clutter(
+    rng: np.random.Generator, palette: MaterialPalette, view: Viewpoint
+) -> tuple[Scene, float]:
     """A close-up of many things on a surface before a wall, and the camera's height over it."""
     near = view.nearest_m
     far = near * rng.uniform(2.0, 5.0)
@@ -174,14 +183,16 @@ def clutter(rng: np.random.Generator, palette: Palette, view: Viewpoint) -> tupl
         [rng.normal(0, 0.6) * far, -far * rng.uniform(0.8, 2.0), rng.normal(0, 0.4) * far]
     )
     lights = (
-        Light(lamp, light_color(rng, 1.6), 2 * far),
-        Light(rng.normal(0, 1, 3) * far * (1, 0, 1) - (0, far, 0), light_color(rng, 0.5), 2 * far),
+        PointLight(lamp, light_color(rng, 1.6), 2 * far),
+        PointLight(
+            rng.normal(0, 1, 3) * far * (1, 0, 1) - (0, far, 0), light_color(rng, 0.5), 2 * far
+        ),
     )
     target = np.array([0.0, 0.0, far * 0.6])
     return compose(b, rng, palette, lights, target, 0.9), float(camera_height)
 
 
-def _sticks(b: Builder, palette: Palette, rng: np.random.Generator, s: float) -> None:
+def _sticks(b: Builder, palette: MaterialPalette, rng: np.random.Generator, s: float) -> None:
     """Thin rods that lean and cross."""
     skin = palette.any(0.3 * s)
     for _ in range(int(rng.integers(3, 12))):

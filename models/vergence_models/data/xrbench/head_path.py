@@ -1,4 +1,4 @@
-"""The head's path through a room."""
+"""The path of the head through a room."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from vergence_models.data.xrbench.meshes import Matrix
 from vergence_models.data.xrbench.recipe import Recipe
 from vergence_models.data.xrbench.things import Room
 
-# The generator's calm head, held back so that it keeps to the clearance around where it starts.
+# The generator's calm head, slowed down so that it stays within the clearance around its start.
 _SWAY = 0.6
 
 
 class HeadPath:
-    """Where the left camera is at any time, before the first frame and after the last one too."""
+    """The pose of the left camera at any time, also before the first frame and after the last."""
 
     def __init__(self, recipe: Recipe, room: Room) -> None:
         # Drawn for the seed alone: the same path, at whatever speed it is walked.

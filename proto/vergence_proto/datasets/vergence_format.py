@@ -1,4 +1,4 @@
-"""The project's own layout: a folder with one rectified sequence, or one pair.
+"""The project's own data set format: a folder with one rectified sequence, or one pair.
 
 ::
 
@@ -6,15 +6,16 @@
                                     differ, cx_right; and fps)
     frame_0000_left.EXT             png, webp or jpg; numbered from 0 without a gap
     frame_0000_right.EXT
-    poses.txt                       optional: one 3x4 camera-to-world matrix a line, left camera,
+    poses.txt                       optional: one 3x4 camera-to-world matrix per line, left camera,
                                     OpenCV axes, metres
     frame_0000_gt.npz               optional truth: disp uint16 = round(64 * px), 0 unknown; vis and
                                     nonspecular, np.packbits(axis=1) masks
     frame_0000_ref.npz              or a sparse reference: u, v, disp
 
 A pair has ``left.EXT``, ``right.EXT`` and, for truth, ``gt.npz`` with disp float32, NaN unknown.
-Disparities are pixel offsets u_left - u_right. Null intrinsics mean unknown: a nominal camera, as
-wide as its focal length (53 degrees) with a baseline of 0.1 m, stands in for disparity's sake.
+Disparities are pixel offsets u_left - u_right. Null intrinsics mean unknown. A nominal camera then
+takes their place: its focal length equals its width (53 degrees), its baseline is 0.1 m. Disparity
+does not depend on it; depth does.
 """
 
 from collections.abc import Mapping
@@ -25,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vergence_proto.datasets.files import (
+    DatasetError,
     JsonObject,
-    LayoutError,
     npz_arrays,
     object_number,
     read_object,
@@ -47,12 +48,15 @@ _NOMINAL_BASELINE_M = 0.1
 
 
 def find(root: Path) -> list[Path]:
-    """Every sequence and pair in or under ``root``."""
+    """List every sequence and pair in or under ``root``."""
     return sorted(path.parent for path in root.rglob("calib.json") if _has_images(path.parent))
 
 
 def open_path(path: Path) -> StereoSource:
-    """Raises LayoutError: a file is missing or wrong; calibration and poses are read at once."""
+    """Open one sequence or pair; calibration and poses are read now.
+
+    Raises DatasetError: a file is missing or wrong.
+    """
     origin = path / "calib.json"
     calib = read_object(origin, "the calibration of a vergence: sequence or pair")
     rig, metric = _rig(origin, calib)
@@ -60,7 +64,7 @@ def open_path(path: Path) -> StereoSource:
         return StereoSource(path.name, rig, None, [_pair(path)], metric)
     fps = object_number(origin, calib, "fps") if calib.get("fps") is not None else None
     if fps is not None and fps <= 0:
-        raise LayoutError(f"{origin}: expected a positive fps, got {fps}")
+        raise DatasetError(f"{origin}: expected a positive fps, got {fps}")
     return StereoSource(path.name, rig, fps, _frames(path, rig, fps), metric)
 
 
@@ -76,7 +80,7 @@ def _image(stem: Path) -> Path | None:
 def _image_or_raise(stem: Path) -> Path:
     found = _image(stem)
     if found is None:
-        raise LayoutError(f"{stem}: not found as {' or '.join(_EXTENSIONS)}")
+        raise DatasetError(f"{stem}: not found as {' or '.join(_EXTENSIONS)}")
     return found
 
 
@@ -104,15 +108,19 @@ def _pair(path: Path) -> FrameFiles:
 def _frames(path: Path, rig: StereoRig, fps: float | None) -> list[FrameFiles]:
     stems = {each.stem for each in path.glob("frame_*_left.*")}
     if not stems:
-        raise LayoutError(f"{path}: expected frame_0000_left and on, or left and right; found none")
+        raise DatasetError(
+            f"{path}: expected frame_0000_left and on, or left and right; found none"
+        )
     count = len(stems)
     missing = next((k for k in range(count) if f"frame_{k:04d}_left" not in stems), None)
-    if missing is not None:  # a gap is an error and not an early end
-        raise LayoutError(f"{path}/frame_{missing:04d}_left: not found, but later frames are there")
+    if missing is not None:  # a sequence with a gap is damaged; it does not end there
+        raise DatasetError(
+            f"{path}/frame_{missing:04d}_left: not found, but later frames are there"
+        )
     trajectory = path / "poses.txt"
     poses = read_matrix_poses(trajectory) if trajectory.exists() else [None] * count
     if len(poses) != count:
-        raise LayoutError(f"{trajectory}: expected {count} poses, one a frame, got {len(poses)}")
+        raise DatasetError(f"{trajectory}: expected {count} poses, one per frame, got {len(poses)}")
     frames = []
     for index, world_from_left in enumerate(poses):
         stem = path / f"frame_{index:04d}"
@@ -144,7 +152,7 @@ def _dense_truth(path: Path) -> Truth:
     arrays = npz_arrays(path, "disp")
     stored = arrays["disp"]
     if stored.dtype != np.uint16 or stored.ndim != 2:
-        raise LayoutError(f"{path}: expected disp as uint16 [H, W], got {stored.dtype}")
+        raise DatasetError(f"{path}: expected disp as uint16 [H, W], got {stored.dtype}")
     offset_px = stored / _TRUTH_STEPS_PER_PX
     offset_px[stored == 0] = np.nan
     return Truth(
@@ -162,7 +170,7 @@ def _unpacked(
     height, width = shape
     packed = arrays[name]
     if packed.dtype != np.uint8 or packed.shape != (height, -(-width // 8)):
-        raise LayoutError(
+        raise DatasetError(
             f"{path}: expected {name} as np.packbits(axis=1) of {width}x{height}, "
             f"got {packed.dtype} {list(packed.shape)}"
         )
@@ -173,7 +181,7 @@ def _sparse_truth(path: Path, shape: tuple[int, int]) -> Truth:
     arrays = npz_arrays(path, "u", "v", "disp")
     u, v = np.rint(arrays["u"]).astype(int), np.rint(arrays["v"]).astype(int)
     if not u.shape == v.shape == arrays["disp"].shape:
-        raise LayoutError(f"{path}: expected u, v and disp of one length")
+        raise DatasetError(f"{path}: expected u, v and disp of one length")
     inside = (u >= 0) & (v >= 0) & (u < shape[1]) & (v < shape[0])
     offset_px = np.full(shape, np.nan, np.float32)
     offset_px[v[inside], u[inside]] = arrays["disp"][inside]

@@ -1,4 +1,4 @@
-"""What teaches the features of `lite` early: the right answer among the scores of a search."""
+"""A loss on the scores of the search, which teaches the features of `lite` early in training."""
 
 from __future__ import annotations
 

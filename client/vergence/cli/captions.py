@@ -1,0 +1,50 @@
+"""Titles, captions and the choice of frames for the pictures of ``demo`` and ``run``."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+
+from vergence.cli.errors import CliError
+from vergence.cli.pictures import Row, sheet
+from vergence.cli.streaming import AnsweredFrame
+from vergence_proto.datasets import StereoSource
+from vergence_proto.types import Origin
+
+_SHEET_ROWS = 4
+
+
+def row_of(answered: AnsweredFrame) -> Row:
+    """Make the row of a frame, with its caption."""
+    parts = [f"frame {answered.index}"]
+    found = answered.accuracy()
+    if found is not None and found.n:
+        parts += [f"EPE {found.epe_px:.2f} px", f"D1 {found.d1_pct:.1f} %"]
+    parts.append(f"{1e3 * answered.latency_s:.0f} ms")
+    result = answered.result
+    if result.origin is not Origin.WARM:
+        parts.append(f"{result.origin.value}, {result.iterations} iterations")
+    return Row(
+        caption="    ".join(parts),
+        left=answered.source.frame.left,
+        disparity_px=result.offset_px,
+        truth_px=answered.source.truth_px,
+    )
+
+
+def title_of(source: StereoSource, model_name: str) -> str:
+    """Return the title of a picture or a table: model, source and image size."""
+    camera = source.rig.left
+    return f"Vergence {model_name}: {source.name}, {camera.width} x {camera.height}"
+
+
+def shown_in_sheet(count: int) -> list[int]:
+    """Choose which of ``count`` frames a sheet shows: the first, the last, and some between."""
+    rows = min(_SHEET_ROWS, count)
+    return sorted({round(row * (count - 1) / max(rows - 1, 1)) for row in range(rows)})
+
+
+def write_sheet(path: Path, title: str, rows: Sequence[Row]) -> None:
+    """Write a sheet of rows as a picture. Raises CliError: the file cannot be written."""
+    if not cv2.imwrite(str(path), sheet(title, rows)):
+        raise CliError(f"cannot write {path}")

@@ -1,0 +1,73 @@
+"""Every example runs against a real server as its docstring says, and prints its result."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.support.zenoh_net import address_of, free_endpoint
+
+PATIENCE_S = 120.0
+EXAMPLES = Path(__file__).parents[2] / "client" / "examples"
+# The address that an example takes, and the lines that it prints.
+PRINTS = {
+    "01_one_pair.py": ("grpc", ["depth (480, 640), median "]),
+    "02_live_camera.py": ("grpc", [" px, age ", "dropped: Drops("]),
+    "03_blocking.py": ("grpc", ["frame 1: ", "cold start", "frame 10: ", "warm"]),
+    "04_openxr_poses.py": ("grpc", ["frame 5: camera at ", "warm"]),
+    "05_reconnect.py": ("grpc", ["resumed after", "frame 12: warm, 12"]),
+    "06_upload_sequence.py": ("http", ["files, ", "epe_px"]),
+    "07_zenoh.py": ("zenoh", ["frame 5: median "]),
+}
+
+
+@pytest.fixture(scope="module")
+def addresses() -> Iterator[dict[str, str]]:
+    """The addresses of one server process, by scheme."""
+    endpoint = free_endpoint()
+    with subprocess.Popen(
+        [
+            *(sys.executable, "-m", "vergence_service", "--zenoh"),
+            *("--grpc-port", "0", "--http-port", "0"),
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        env={**os.environ, "VERGENCE_ZENOH__LISTEN": f'["{endpoint}"]'},
+    ) as process:
+        assert process.stdout is not None
+        _, grpc, http, _ = process.stdout.readline().split()
+        yield {
+            "grpc": grpc.replace("grpc=", "grpc://"),
+            "http": http.replace("http=", "http://"),
+            "zenoh": address_of(endpoint),
+        }
+        process.terminate()
+        assert process.wait(timeout=PATIENCE_S) == 0
+
+
+def test_every_example_is_listed() -> None:
+    assert sorted(PRINTS) == sorted(file.name for file in EXAMPLES.glob("*.py"))
+    for file in EXAMPLES.glob("*.py"):
+        assert len(file.read_text("utf-8").splitlines()) <= 60, file.name
+
+
+@pytest.mark.parametrize("name", sorted(PRINTS))
+def test_an_example_runs_and_prints_its_result(
+    name: str, addresses: dict[str, str], tmp_path: Path
+) -> None:
+    scheme, expected = PRINTS[name]
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / name, "--server", addresses[scheme]],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    for part in expected:
+        assert part in done.stdout
