@@ -47,7 +47,7 @@ def open_path(path: Path, *, steps: float = _STEPS_PER_PX) -> StereoSource:
             f"{path / 'camera_5'}: expected images 171206_034625454_Camera_5.jpg, found none"
         )
     if not steps > 0:
-        raise DatasetError(f"{path}: expected positive steps a pixel, got {steps:g}")
+        raise DatasetError(f"{path}: expected positive steps per pixel, got {steps:g}")
     files = [
         FrameFiles(
             left,

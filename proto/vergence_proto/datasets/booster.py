@@ -7,7 +7,7 @@
     mask_00.png               0: the right camera does not see it
     calib_00-02.xml           OpenCV: proj_matL and proj_matR [3, 4], baselineLR (mm)
 
-The test half has no truth. The illuminations of a scene are read as one source, one a frame.
+The test half has no truth. The illuminations of a scene are read as one source, one per frame.
 """
 
 import xml.etree.ElementTree as ElementTree

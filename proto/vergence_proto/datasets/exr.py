@@ -29,7 +29,7 @@ _OPENCV_SWITCH = "OPENCV_IO_ENABLE_OPENEXR"
 def read_exr(path: Path) -> Plane:
     """Read the first of R, Y, G or whatever channel there is, float32 [H, W].
 
-    Raises DatasetError: missing, damaged, or of a kind that nothing here decodes.
+    Raises DatasetError: the file is missing, damaged, or of a kind that nothing here decodes.
     """
     data = existing(path, "an OpenEXR file").read_bytes()
     if not data.startswith(_MAGIC):

@@ -3,7 +3,7 @@
 ::
 
     DRIVE/image_02 image_03/data/%010d.png      colour left and right (or image_00, image_01)
-    DRIVE/image_02/timestamps.txt               2011-09-26 13:02:25.964389445, one a frame
+    DRIVE/image_02/timestamps.txt               2011-09-26 13:02:25.964389445, one per frame
     DRIVE/oxts/data/%010d.txt                   lat lon alt roll pitch yaw ... of the GPS and IMU
     DRIVE/proj_depth/groundtruth/image_02/%010d.png    of the depth benchmark: metres x256, 0 none
     calib_cam_to_cam.txt calib_velo_to_cam.txt calib_imu_to_velo.txt     in the drive's own folder
@@ -124,7 +124,7 @@ def _read_transform(path: Path) -> Pose:
 
 
 def _read_poses(folder: Path, imu_from_left: Pose) -> dict[int, Pose]:
-    """World_from_left by frame number."""
+    """Read world_from_left of each frame number."""
     fixes = {number_in(path): _read_fix(path) for path in found(folder, "*.txt")}
     if not fixes:
         return {}
@@ -171,7 +171,7 @@ def _read_times(path: Path) -> list[int]:
     if not path.exists():
         return []
     times_ns = []
-    for line in read_lines(path, "a date and time a line"):
+    for line in read_lines(path, "a date and time per line"):
         whole, _, fraction = line.partition(".")
         try:
             time = datetime.datetime.fromisoformat(whole).replace(tzinfo=datetime.UTC)

@@ -1,4 +1,4 @@
-"""Folders and text files as people have them, with what Windows and macOS add.
+"""Folders and text files, with the bytes and names that Windows and macOS add.
 
 A name that starts with a dot and a ``__MACOSX`` folder are no data. A text file may start with a
 byte order mark and end its lines with CR LF.
@@ -66,9 +66,9 @@ def read_lines(path: Path, purpose: str) -> list[str]:
 
 
 def read_rows(path: Path, count: int, purpose: str) -> list[list[float]]:
-    """Read ``count`` numbers a line; a first line of words is a heading.
+    """Read ``count`` numbers per line; a first line of words is a heading.
 
-    Raises DatasetError: no such file, a line of words, or another count.
+    Raises DatasetError: there is no such file, a line of words, or another count.
     """
     lines = read_lines(path, purpose)
     heading = bool(lines) and lines[0][0].isalpha()
@@ -82,7 +82,7 @@ def read_rows(path: Path, count: int, purpose: str) -> list[list[float]]:
 def read_keyed(path: Path, purpose: str, **counts: int) -> Mapping[str, list[float]]:
     """Read the lines ``KEY: numbers`` of the named keys; a key without a line is left out.
 
-    Raises DatasetError: no such file, or another count of numbers.
+    Raises DatasetError: there is no such file, or another count of numbers.
     """
     keyed = {}
     for line in read_lines(path, purpose):

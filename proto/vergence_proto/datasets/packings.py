@@ -16,16 +16,16 @@ _NOMINAL_BASELINE_M = 0.1
 
 
 def size_of(path: Path) -> tuple[int, int]:
-    """Width and height of an image.
+    """Read the width and height of an image.
 
-    Raises DatasetError: it is missing or damaged.
+    Raises DatasetError: the file is missing or damaged.
     """
     height, width = read_image(path).shape[:2]
     return width, height
 
 
 def nominal_rig(origin: Path, size: tuple[int, int]) -> StereoRig:
-    """A camera as wide as its focal length (53 degrees), for images without a calibration."""
+    """Make a nominal rig for images without calibration: its focal length is the width."""
     width, height = size
     return rectified_rig(
         origin,
@@ -38,9 +38,9 @@ def nominal_rig(origin: Path, size: tuple[int, int]) -> StereoRig:
 
 
 def read_grey(path: Path) -> NDArray[Any]:
-    """Read a one-channel PNG or PGM as it is stored; of a grey PNG in colour, one channel.
+    """Read a one-channel PNG or PGM as it is stored; three equal channels become one.
 
-    Raises DatasetError: missing, damaged or coloured.
+    Raises DatasetError: the file is missing, damaged or coloured.
     """
     if path.suffix.lower() == ".png":
         stored = read_stored_png(path)
@@ -60,7 +60,7 @@ def read_grey(path: Path) -> NDArray[Any]:
 def read_scaled(path: Path, steps_per_px: float, *, bits: int = 16) -> Plane:
     """Read a disparity that is stored times ``steps_per_px``; 0 is unknown.
 
-    Raises DatasetError: missing, damaged, or not of ``bits`` bits.
+    Raises DatasetError: the file is missing, damaged, or not of ``bits`` bits.
     """
     stored = read_grey(path)
     if stored.dtype != np.dtype(f"uint{bits}"):
@@ -74,9 +74,9 @@ def read_scaled(path: Path, steps_per_px: float, *, bits: int = 16) -> Plane:
 
 
 def read_mask(path: Path) -> Mask:
-    """Where a grey image is not 0.
+    """Read where a grey image is not 0.
 
-    Raises DatasetError: missing, damaged or coloured.
+    Raises DatasetError: the file is missing, damaged or coloured.
     """
     return np.asarray(read_grey(path) != 0)
 
@@ -84,7 +84,7 @@ def read_mask(path: Path) -> Mask:
 def read_npy(path: Path, purpose: str) -> NDArray[Any]:
     """Read a plane from an .npy.
 
-    Raises DatasetError: missing, damaged, or not [H, W].
+    Raises DatasetError: the file is missing, damaged, or not [H, W].
     """
     existing(path, purpose)
     try:
@@ -97,7 +97,7 @@ def read_npy(path: Path, purpose: str) -> NDArray[Any]:
 
 
 def known_offsets(values: NDArray[Any]) -> Plane:
-    """Disparity as positive pixels; NaN where it is 0 or not finite.
+    """Return disparity as positive pixels; NaN where it is 0 or not finite.
 
     Some files store u_right - u_left: if no value is positive, the sign is turned.
     """
@@ -110,7 +110,7 @@ def known_offsets(values: NDArray[Any]) -> Plane:
 
 
 def offsets_from_depth(depth_m: NDArray[Any], px_m: float) -> Plane:
-    """``px_m / depth``, where ``px_m`` is focal length times baseline; NaN without a depth."""
+    """Return ``px_m / depth``; ``px_m`` is focal length times baseline. NaN without a depth."""
     offset_px = np.full(depth_m.shape, np.nan, np.float32)
     known = np.isfinite(depth_m) & (depth_m > 0)
     offset_px[known] = px_m / depth_m[known]

@@ -4,8 +4,8 @@
 
     ROOT/train/0001/frame_left frame_right/frame_left_%04d.png   1920x1080, numbered from 1
     ROOT/train/0001/disp1_left/disp1_left_%04d.dsp5              HDF5, "disparity", of 3840x2160
-    ROOT/train/0001/cam_data/intrinsics.txt                      fx fy cx cy a frame
-    ROOT/train/0001/cam_data/extrinsics.txt                      camera_from_world, 4x4 a frame
+    ROOT/train/0001/cam_data/intrinsics.txt                      fx fy cx cy per frame
+    ROOT/train/0001/cam_data/extrinsics.txt                      camera_from_world, 4x4 per frame
 
 Truth has twice the images' resolution but counts pixels of the images; of each 2x2 the first is
 taken, as the data set's own tools do. The baseline is 0.065 m. Reading truth needs h5py.
@@ -75,10 +75,10 @@ def open_path(path: Path) -> StereoSource:
 
 
 def _read_poses(path: Path) -> dict[int, Pose]:
-    """World_from_left by frame number."""
+    """Read world_from_left of each frame number."""
     if not path.exists():
         return {}
-    rows = read_rows(path, 16, "camera_from_world, 16 numbers a line")
+    rows = read_rows(path, 16, "camera_from_world, 16 numbers per line")
     return {
         number: checked_pose(np.reshape(row, (4, 4)), f"{path}, line {number}").inverse()
         for number, row in enumerate(rows, start=1)
@@ -88,9 +88,9 @@ def _read_poses(path: Path) -> dict[int, Pose]:
 def _read_rig(path: Path, size: tuple[int, int]) -> tuple[StereoRig, bool]:
     if not path.exists():
         return nominal_rig(path, size), False
-    rows = read_rows(path, 4, "fx fy cx cy a line")
+    rows = read_rows(path, 4, "fx fy cx cy per line")
     if not rows:
-        raise DatasetError(f"{path}: expected fx fy cx cy a line, got an empty file")
+        raise DatasetError(f"{path}: expected fx fy cx cy per line, got an empty file")
     fx, fy, cx, cy = rows[0]
     rig = rectified_rig(path, size, fx=fx, fy=fy, cx=cx, cy=cy, baseline_m=_BASELINE_M)
     # One rig describes a whole source: of a zoom only the disparities stay right.

@@ -85,14 +85,14 @@ def _archive(path: Path, kind: str) -> Path:
 
 
 def _read_poses(path: Path) -> dict[int, Pose]:
-    """World_from_left by frame number."""
+    """Read world_from_left of each frame number."""
     if not path.exists():
         return {}
     return {
         int(row[0]): checked_pose(
             np.reshape(row[2:], (4, 4)), f"{path}, frame {int(row[0])}"
         ).inverse()
-        for row in read_rows(path, 18, "frame, cameraID and 16 numbers a line")
+        for row in read_rows(path, 18, "frame, cameraID and 16 numbers per line")
         if row[1] == 0
     }
 
@@ -100,7 +100,7 @@ def _read_poses(path: Path) -> dict[int, Pose]:
 def _read_rig(path: Path, size: tuple[int, int]) -> tuple[StereoRig, float | None]:
     """The rig, and focal length times baseline, None where the rig is nominal."""
     if path.exists():
-        rows = read_rows(path, 6, "frame, cameraID, fx, fy, cx, cy a line")
+        rows = read_rows(path, 6, "frame, cameraID, fx, fy, cx, cy per line")
         lefts = [row[2:] for row in rows if row[1] == 0]
         if not lefts:
             raise DatasetError(f"{path}: expected lines with cameraID 0, found none")
