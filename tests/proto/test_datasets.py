@@ -6,20 +6,22 @@ import numpy as np
 import pytest
 
 from tests.support import dataset_trees as trees
+from tests.support import field_trees
 from tests.support.sources import assert_images, assert_poses, assert_truth, rig_of
 from vergence_proto.datasets import DATASETS, find_sources, open_source
 from vergence_proto.geometry import RectifiedRig
 
+TREES = {**trees.TREES, **field_trees.TREES}
 OPTIONS = {"sceneflow": "?fx=20"}
 
 
 def test_every_layout_has_a_tree_here() -> None:
-    assert set(trees.TREES) == set(DATASETS)
+    assert set(TREES) == set(DATASETS)
 
 
-@pytest.mark.parametrize("kind", trees.TREES)
+@pytest.mark.parametrize("kind", TREES)
 def test_what_is_found_under_a_folder_opens(kind: str, tmp_path: Path) -> None:
-    trees.TREES[kind](tmp_path)
+    TREES[kind](tmp_path)
     (spec,) = find_sources(f"{kind}:{tmp_path}{OPTIONS.get(kind, '')}")
     source = open_source(spec)
     frames = list(source)

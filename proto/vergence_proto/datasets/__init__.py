@@ -15,6 +15,20 @@ kind           one source                         it has
                a pair
 =============  =================================  ==================================================
 
+================== ========================================== ====================================
+``sintel``         ``ROOT/training/final_left/alley_1``       truth; poses with the .cam files
+``spring``         ``ROOT/train/0001``                        poses; truth, which needs h5py
+``vkitti2``        ``ROOT/Scene01/clone``                     poses, truth
+``kittiraw``       ``DATE/DATE_drive_0001_sync``              poses; LiDAR truth of its benchmark
+``drivingstereo``  ``ROOT/train-left-image/DRIVE``            truth
+``apollo``         ``ROOT/stereo_train_001``                  truth; no metres
+``irs``            ``ROOT/Home/SCENE``                        truth
+``flyingthings``   ``ROOT/train/image_clean/0000000``, a pair truth; no metres
+``booster``        ``ROOT/train/balanced/SCENE``              truth
+``instereo2k``     ``ROOT/train/part1/000000``, a pair        truth; no metres
+``middlebury2006`` ``ROOT/FullSize/Aloe``, a pair             truth; of 2001 to 2006
+================== ========================================== ====================================
+
 Every source has OpenCV camera axes, metres, nanoseconds, and truth as pixel offsets
 u_left - u_right, whatever the conventions of its data set. Each module states the layout of the
 files that it reads.
@@ -25,14 +39,25 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vergence_proto.datasets import (
+    apollo,
+    booster,
+    drivingstereo,
     eth3d,
     euroc,
+    flyingthings,
+    instereo2k,
+    irs,
     kitti,
     kitti_pairs,
+    kittiraw,
     middlebury,
+    middlebury2006,
     sceneflow,
+    sintel,
+    spring,
     tartanair,
     vergence_format,
+    vkitti2,
 )
 from vergence_proto.datasets.ahead import read_ahead
 from vergence_proto.datasets.files import DatasetError, numbers
@@ -90,6 +115,17 @@ DATASETS = {
     "euroc": Dataset(euroc.open_path, euroc.find),
     "middlebury": Dataset(middlebury.open_path, middlebury.find),
     "eth3d": Dataset(eth3d.open_path, eth3d.find),
+    "sintel": Dataset(sintel.open_path, sintel.find),
+    "spring": Dataset(spring.open_path, spring.find),
+    "vkitti2": Dataset(vkitti2.open_path, vkitti2.find),
+    "booster": Dataset(booster.open_path, booster.find),
+    "instereo2k": Dataset(instereo2k.open_path, instereo2k.find),
+    "drivingstereo": Dataset(drivingstereo.open_path, drivingstereo.find),
+    "middlebury2006": Dataset(middlebury2006.open_path, middlebury2006.find, options=("scale",)),
+    "kittiraw": Dataset(kittiraw.open_path, kittiraw.find),
+    "flyingthings": Dataset(flyingthings.open_path, flyingthings.find),
+    "irs": Dataset(irs.open_path, irs.find),
+    "apollo": Dataset(apollo.open_path, apollo.find, options=("steps",)),
 }
 
 

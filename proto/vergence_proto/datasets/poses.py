@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from vergence_proto.datasets.files import DatasetError, numbers, read_text
+from vergence_proto.errors import BadPose
 from vergence_proto.geometry import Matrix, Pose
 
 # Files print six digits, and some rotations are products in float32.
@@ -38,7 +39,10 @@ def checked_pose(matrix: Matrix, origin: str) -> Pose:
 
     Raises DatasetError: the matrix is no rigid transform.
     """
-    pose = Pose.from_matrix(matrix)
+    try:
+        pose = Pose.from_matrix(matrix)
+    except BadPose as wrong:
+        raise DatasetError(f"{origin}: {wrong}") from None
     error = np.abs(pose.rotation @ pose.rotation.T - np.eye(3)).max()
     rigid = error <= _ORTHONORMAL_TOLERANCE and np.linalg.det(pose.rotation) > 0
     if not (rigid and np.isfinite(pose.translation_m).all()):
