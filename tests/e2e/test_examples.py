@@ -25,7 +25,7 @@ PRINTS = {
 
 
 @pytest.fixture(scope="module")
-def addresses() -> Iterator[dict[str, str]]:
+def addresses(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
     """The addresses of one server process, by scheme."""
     endpoint = free_endpoint()
     with subprocess.Popen(
@@ -36,7 +36,11 @@ def addresses() -> Iterator[dict[str, str]]:
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,
-        env={**os.environ, "VERGENCE_ZENOH__LISTEN": f'["{endpoint}"]'},
+        env={
+            **os.environ,
+            "VERGENCE_ZENOH__LISTEN": f'["{endpoint}"]',
+            "VERGENCE_BATCH__DIRECTORY": str(tmp_path_factory.mktemp("jobs")),
+        },
     ) as process:
         assert process.stdout is not None
         _, grpc, http, _ = process.stdout.readline().split()
