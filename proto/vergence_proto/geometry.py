@@ -47,9 +47,9 @@ class Pose:
         Raises
         ------
         BadPose
-            The matrix has another shape, is not made of numbers, or its last row is not 0 0 0 1
-            within 0.001. A session refuses a matrix that is scaled, sheared, mirrored or not
-            finite when it is sent.
+            The matrix has another shape, a number is not finite, the last row is not 0 0 0 1, or
+            the rotation is not orthonormal with determinant +1 (scaled, sheared, mirrored); each
+            within 0.001.
         """
         values = _float64(matrix, "a [3, 4] or [4, 4] matrix")
         if values.shape not in ((3, 4), (4, 4)):
@@ -63,6 +63,9 @@ class Pose:
                 f"expected 0 0 0 1 as the last row, got {values[3].tolist()}; "
                 "a pose is row-major: a matrix of a graphics library may have to be transposed"
             )
+        check_rotation(rotation)
+        if not np.isfinite(translation_m).all():
+            raise BadPose(f"expected a finite translation, got {translation_m.tolist()}")
         return cls(rotation, translation_m)
 
     @classmethod

@@ -3,7 +3,7 @@
     python tests/benchmarks/batch_throughput.py --json FILE
 
 Every round measures each of these once on the same sequence, so that they share the machine's
-moods; medians are told.
+moods; the benchmark prints medians.
 
 - ``bare_fps``: the model loop in this process: read a frame from disk, step it, the next one.
 - ``memory_fps``: the same with all frames in memory, the most that the model can do.
@@ -115,7 +115,7 @@ async def batch_fps(http: httpx.AsyncClient, archive: bytes, frames: int) -> flo
 
 
 async def ended(http: httpx.AsyncClient, job_id: str) -> dict[str, Any]:
-    """The job's last state, told when it is reached."""
+    """The job's last state, once it is reached."""
     job: dict[str, Any] = {}
     async with http.stream("GET", f"/v1/sequences/{job_id}/events") as events:
         async for line in events.aiter_lines():

@@ -106,10 +106,10 @@ def main() -> None:
             methods[f"in_turn_{count}_ms"] = partial(in_turn, sessions, feed, count)
         results = measure(methods, given.rounds)
     results |= {"embedded_mb": round(whole / 1e6, 1), "shared_mb": round(shared / 1e6, 1)}
-    told = {"isa": instruction_set(), "model": given.model, **results}
-    sys.stdout.write(" ".join(f"{name} {value}" for name, value in told.items()) + "\n")
+    row = {"isa": instruction_set(), "model": given.model, **results}
+    sys.stdout.write(" ".join(f"{name} {value}" for name, value in row.items()) + "\n")
     if given.json:
-        given.json.write_text(json.dumps(told) + "\n", "utf-8")
+        given.json.write_text(json.dumps(row) + "\n", "utf-8")
 
 
 if __name__ == "__main__":

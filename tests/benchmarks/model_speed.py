@@ -116,10 +116,10 @@ def main() -> None:
         "fps": 1e3 / wall_ms,
         **{name: start_ms for name, (start_ms, _) in first_frames.items()},
     }
-    told = {"isa": instruction_set()} | {name: round(value, 2) for name, value in results.items()}
-    sys.stdout.write(" ".join(f"{name} {value}" for name, value in told.items()) + "\n")
+    row = {"isa": instruction_set()} | {name: round(value, 2) for name, value in results.items()}
+    sys.stdout.write(" ".join(f"{name} {value}" for name, value in row.items()) + "\n")
     if given.json:
-        given.json.write_text(json.dumps(told) + "\n", "utf-8")
+        given.json.write_text(json.dumps(row) + "\n", "utf-8")
 
 
 if __name__ == "__main__":

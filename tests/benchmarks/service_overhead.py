@@ -2,7 +2,8 @@
 
     python tests/benchmarks/service_overhead.py --json FILE
 
-Every round measures each of these once, so that they share the machine's moods; medians are told.
+Every round measures each of these once, so that all of them share the machine's load. The benchmark
+prints medians.
 
 - ``model_ms``: a warm step of the model in this process, nothing round it.
 - ``service_ms``: the same step through the SDK, loopback gRPC and a real server process, one frame

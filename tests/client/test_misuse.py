@@ -148,6 +148,10 @@ def test_a_transposed_matrix_is_no_pose(pose: Pose) -> None:
 def test_a_scaled_rotation_is_not_sent(pose: Pose, scale: float) -> None:
     with pytest.raises(BadPose, match="orthonormal"):
         codec.pose_to_proto(Pose(pose.rotation * scale, pose.translation_m))
+    matrix = pose.matrix
+    matrix[:3, :3] *= scale
+    with pytest.raises(BadPose, match="orthonormal"):
+        Pose.from_matrix(matrix)
 
 
 @given(POSES, st.sampled_from([math.nan, math.inf]), st.integers(0, 2), st.integers(0, 3))
@@ -157,7 +161,7 @@ async def test_a_number_that_is_not_finite_is_not_sent(
     matrix = pose.matrix
     matrix[row, column] = number
     with np.errstate(invalid="ignore"), pytest.raises(BadPose):
-        codec.pose_to_proto(Pose.from_matrix(matrix))
+        Pose.from_matrix(matrix)
 
 
 @pytest.mark.parametrize(

@@ -99,7 +99,7 @@ async def test_a_sequence_goes_on_from_where_it_was_when_the_server_was_killed(
         job = await ended(client, job_id)
         resumed = await disparities(client, job_id)
         stepped = await frames_stepped(client)
-        await eventually(lambda: not checkpoints_below(tmp_path))  # it goes when the end is told
+        await eventually(lambda: not checkpoints_below(tmp_path))  # removed when the job ends
     assert job["state"] == "done"
     assert 0 < stepped < 60, "the second server began at the first frame"
 

@@ -61,13 +61,13 @@ def test_the_answer_is_the_one_that_another_cpu_recorded(footage: Footage) -> No
     found = answer(footage)[:, ::EVERY, ::EVERY]
     shares = [agreeing(*pair) for pair in zip(found, maps, strict=True)]
     assert min(shares) >= SHARE, f"{shares} on {instruction_set()}, from {recorded['isa']}"
-    assert agreeing(maps[0], maps[1]) < SHARE  # as the tolerance tells one frame from the next
+    assert agreeing(maps[0], maps[1]) < SHARE  # the tolerance separates two frames
 
 
 def test_sums_in_32_bits_change_no_answer(
     footage: Footage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It decides on CPUs without VNNI, where onnxruntime adds in 16 bits unless it is told."""
+    """This decides on CPUs without VNNI, where onnxruntime adds in 16 bits by default."""
     usual = answer(footage)
 
     class PreciseOptions(onnxruntime.SessionOptions):  # type: ignore[misc] # it has no types

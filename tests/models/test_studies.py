@@ -105,9 +105,9 @@ def test_what_has_no_past_is_the_same_at_every_speed(tables: dict[str, Table]) -
 
 def test_noise_is_of_just_the_size_that_was_asked_for(wall: Footage) -> None:
     noisy = with_pose_noise(wall, deg=0.6, m=0.002)
-    true, told = ([view.world_from_left for view in footage.views] for footage in (wall, noisy))
+    true, shifted = ([view.world_from_left for view in footage.views] for footage in (wall, noisy))
     for k in range(1, len(true)):
-        a, b, c, d = true[k - 1], true[k], told[k - 1], told[k]
+        a, b, c, d = true[k - 1], true[k], shifted[k - 1], shifted[k]
         assert a is not None and b is not None and c is not None and d is not None  # noqa: PT018
         error = (d.inverse() @ c) @ (b.inverse() @ a).inverse()
         angle = np.degrees(np.arccos((np.trace(error.rotation) - 1) / 2))
@@ -175,7 +175,7 @@ def test_studies_agree_with_one_another(tables: dict[str, Table]) -> None:
 def test_the_same_seed_gives_the_same_tables(
     tables: dict[str, Table], networks: list[StudiedNetwork], tmp_path: Path
 ) -> None:
-    again = new_bench(networks, tmp_path)  # renders its clips anew
+    again = new_bench(networks, tmp_path)  # renders its clips again
     assert warp_ablation(again) == tables["warp"]
 
 
@@ -243,14 +243,14 @@ def test_the_command_writes_what_it_ran_and_keeps_the_rest(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         pytest.param(["--weights", "nowhere"], "no manifest at nowhere", id="no weights"),
         pytest.param(["--run", "nowhere"], "no checkpoint at nowhere", id="no run"),
     ],
 )
-def test_what_is_missing_is_said(arguments: list[str], told: str, tmp_path: Path) -> None:
-    with pytest.raises(SystemExit, match=told):
+def test_what_is_missing_is_said(arguments: list[str], message: str, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match=message):
         main(["--json", str(tmp_path / "out.json"), *arguments])
 
 

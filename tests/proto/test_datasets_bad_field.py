@@ -1,4 +1,4 @@
-"""What is wrong in a data set of the field is told in one sentence that names the file."""
+"""An error in a data set is one sentence that names the file."""
 
 import sys
 from pathlib import Path

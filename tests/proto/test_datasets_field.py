@@ -15,7 +15,7 @@ from vergence_proto.datasets import DATASETS, find_sources, open_source
 from vergence_proto.geometry import RectifiedRig
 
 ALL_TREES = {**trees.TREES, **field.TREES}
-SHARED = {"middlebury", "eth3d"}  # one calibration format; ETH3D is told by its folders
+SHARED = {"middlebury", "eth3d"}  # one calibration format; its folders identify ETH3D
 
 
 def _set_visible(mask: Any, expected: Any) -> None:

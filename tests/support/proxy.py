@@ -6,7 +6,7 @@ from contextlib import asynccontextmanager, suppress
 
 
 class Proxy:
-    """Forwards bytes both ways to one address until told otherwise."""
+    """Forwards bytes both ways to one address until it is cut."""
 
     def __init__(self, target: str) -> None:
         self._target = target

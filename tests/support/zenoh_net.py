@@ -15,7 +15,7 @@ _PATIENCE_S = 20.0
 
 
 def free_endpoint() -> str:
-    """Zenoh does not tell which port it was given, so one is chosen here."""
+    """Zenoh does not report the port that it was given, so one is chosen here."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
