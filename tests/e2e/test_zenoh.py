@@ -16,6 +16,7 @@ from vergence import (
     Delivery,
     DepthClient,
     DepthResult,
+    DepthSession,
     FrameTooLarge,
     OutputFormat,
     PlaneEncoding,
@@ -62,7 +63,31 @@ async def test_a_sequence_is_answered_alike_over_grpc_and_zenoh(delivery: Delive
         )
 
 
-async def test_every_live_frame_is_accounted_for() -> None:
+async def until_displaced(session: DepthSession, count: int) -> None:
+    await eventually(lambda: session.drops.displaced == count)
+
+
+async def test_a_newer_frame_displaces_one_that_waits() -> None:
+    model = RecallModel()
+    async with (
+        lone_server(model, streams__credit=5) as (_, address),
+        DepthClient(address) as client,
+        client.open_session(RIG) as session,
+    ):
+        with model.busy():
+            submit(session, 1)
+            await asyncio.to_thread(model.wait_until_entered)
+            submit(session, 2)
+            # One frame at a time is on its way: Zenoh may drop frames of a burst.
+            for displaced, frame_id in enumerate((3, 4, 5), start=1):
+                submit(session, frame_id)
+                await until_displaced(session, displaced)
+        results = [await anext(session) for _ in range(2)]
+    assert [result.frame_id for result in results] == [1, 5]
+    assert results[1].frames_skipped == 3
+
+
+async def test_every_frame_of_a_burst_is_accounted_for() -> None:
     model = RecallModel()
     async with (
         lone_server(model, streams__credit=5) as (_, address),
@@ -74,11 +99,12 @@ async def test_every_live_frame_is_accounted_for() -> None:
             await asyncio.to_thread(model.wait_until_entered)
             for frame_id in (2, 3, 4, 5, 6):
                 submit(session, frame_id)
-            await eventually(lambda: session.drops.displaced == 3)
-        results = [await anext(session) for _ in range(2)]
-    assert [result.frame_id for result in results] == [1, 5]
-    assert (session.drops.at_source, session.drops.displaced) == (1, 3)
-    assert results[1].frames_skipped == 3
+            # Displaced in the server, or dropped by Zenoh on a busy machine.
+            await until_displaced(session, 3)
+        first, second = [(await anext(session)).frame_id for _ in range(2)]
+    assert (session.drops.at_source, session.drops.displaced, session.drops.total) == (1, 3, 4)
+    assert first == 1
+    assert 2 <= second <= 5
 
 
 async def test_streams_go_to_the_server_with_the_most_room_and_stay_there() -> None:
