@@ -27,6 +27,7 @@ from vergence.blocking import BlockingClient, BlockingSession, depth
 from vergence.client import DEFAULT_SERVER, DepthClient
 from vergence.errors import NotOpen
 from vergence.info import ModelInfo, ServerInfo, StreamInfo
+from vergence.reprojection import DepthView, View, reproject
 from vergence.results import DepthResult, Drops, EventKind, SessionEvent
 from vergence.session import DepthSession
 from vergence.transports.base import ConnectionLost
@@ -89,6 +90,7 @@ __all__ = [
     "DepthError",
     "DepthResult",
     "DepthSession",
+    "DepthView",
     "DisparityMap",
     "Distortion",
     "Draining",
@@ -128,5 +130,7 @@ __all__ = [
     "UnknownSequence",
     "UnknownStream",
     "UploadTooLarge",
+    "View",
     "depth",
+    "reproject",
 ]

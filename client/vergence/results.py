@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+from vergence_proto.geometry import Axes
 from vergence_proto.types import DisparityMap
 
 
@@ -41,6 +42,8 @@ class DepthResult(DisparityMap):
     """Seconds from ``capture_ns`` to the arrival of this result."""
     drops: Drops = field(default_factory=Drops)
     """The drops of the session until this result."""
+    axes: Axes = Axes.OPENCV
+    """The axes of ``world_from_left``: those of the session."""
 
 
 class EventKind(StrEnum):
