@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from vergence.client import DEFAULT_SERVER, DepthClient
 from vergence.errors import NotOpen
 from vergence.info import ModelInfo, ServerInfo, StreamInfo
+from vergence.reprojection import DepthView, Fill, View
 from vergence.results import DepthResult, Drops, SessionEvent
 from vergence.session import DepthSession, WorldFromLeft
-from vergence_proto.geometry import Axes, RectifiedRig
+from vergence_proto.geometry import Axes, Matrix, Pose, RectifiedRig
 from vergence_proto.types import Delivery, ImageEncoding, OutputFormat, StereoRig
 
 Value = TypeVar("Value")
@@ -136,6 +137,25 @@ class BlockingSession:
     def __exit__(self, *exc_info: object) -> None:
         """End the stream; the server frees its state."""
         self._loop.wait(self._session.__aexit__(*exc_info))
+
+    @property
+    def latest(self) -> DepthResult | None:
+        """The newest result so far; None before the first. Any thread may read it, at any time."""
+        return self._session.latest
+
+    def depth_at(
+        self,
+        world_from_view: Pose | Matrix,
+        view: View | None = None,
+        *,
+        at_ns: int | None = None,
+        fill: Fill = "far",
+        max_age_s: float = 0.5,
+    ) -> DepthView | None:
+        """Show the newest result from another pose; see :meth:`DepthSession.depth_at`."""
+        return self._session.depth_at(
+            world_from_view, view, at_ns=at_ns, fill=fill, max_age_s=max_age_s
+        )
 
     def submit(
         self,

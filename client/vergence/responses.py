@@ -7,11 +7,12 @@ from dataclasses import fields
 
 from vergence.connection import RESET
 from vergence.in_flight import FramesInFlight
+from vergence.recent import RecentResults
 from vergence.results import DepthResult, Drops
 from vergence.transports.base import ConnectionLost
 from vergence_proto import codec
 from vergence_proto.errors import DepthError, FrameStale
-from vergence_proto.geometry import RectifiedRig
+from vergence_proto.geometry import Axes, RectifiedRig
 from vergence_proto.types import DisparityMap
 from vergence_proto.v1 import depth_pb2 as pb
 
@@ -24,11 +25,13 @@ class ResponseRouter:
 
     rig: RectifiedRig
 
-    def __init__(self, in_flight: FramesInFlight) -> None:
+    def __init__(self, in_flight: FramesInFlight, axes: Axes) -> None:
+        self.recent = RecentResults()
         self.opened: pb.StreamOpened | None = None  # None: the stream was never open
         self.error: Exception | None = None  # the error that ended the stream
         self.reset_after: int | None = None  # the last frame before a reset not yet confirmed
         self._in_flight = in_flight
+        self._axes = axes
         self._ended = False
         self._unread: deque[DepthResult | DepthError] = deque()
         self._arrived = asyncio.Event()
@@ -94,9 +97,12 @@ class ResponseRouter:
             self._failed(message.frame_id, error)
             return
         frame = self._in_flight.pop(message.frame_id)
-        result = _depth_result(disparity_map, age_s=age_s, drops=self._in_flight.drops)
+        result = _depth_result(
+            disparity_map, age_s=age_s, drops=self._in_flight.drops, axes=self._axes
+        )
         if frame is None:
             return
+        self.recent.add(result)
         if frame.answer is None:
             self._deliver(result)
         elif not frame.answer.done():  # done: the caller was cancelled
@@ -131,6 +137,8 @@ class ResponseRouter:
         self._arrived.set()
 
 
-def _depth_result(disparity_map: DisparityMap, *, age_s: float, drops: Drops) -> DepthResult:
+def _depth_result(
+    disparity_map: DisparityMap, *, age_s: float, drops: Drops, axes: Axes
+) -> DepthResult:
     values = {each.name: getattr(disparity_map, each.name) for each in fields(DisparityMap)}
-    return DepthResult(**values, age_s=age_s, drops=drops)
+    return DepthResult(**values, age_s=age_s, drops=drops, axes=axes)

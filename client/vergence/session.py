@@ -14,6 +14,7 @@ from vergence.errors import NotOpen
 from vergence.in_flight import FrameInFlight, FramesInFlight
 from vergence.info import ModelInfo
 from vergence.info_codec import model_info_from_proto
+from vergence.reprojection import DepthView, Fill, View
 from vergence.responses import ResponseRouter
 from vergence.results import DepthResult, Drops, SessionEvent
 from vergence.transports.base import Transport
@@ -68,7 +69,7 @@ class DepthSession:
     def __init__(self, setup: SessionSetup, /) -> None:
         self._setup = setup
         self._in_flight = FramesInFlight()
-        self._responses = ResponseRouter(self._in_flight)
+        self._responses = ResponseRouter(self._in_flight, codec.axes_from_proto(setup.opening.axes))
         self._connection = StreamConnection(
             setup.transport, setup.opening, self._responses, setup.on_event
         )
@@ -147,6 +148,54 @@ class DepthSession:
     def round_trip_s(self) -> float | None:
         """Network time in seconds, there and back, of the latest ping; None before the first."""
         return self._connection.round_trip_s
+
+    @property
+    def latest(self) -> DepthResult | None:
+        """The newest result so far; None before the first. Any thread may read it, at any time."""
+        return self._responses.recent.latest
+
+    def depth_at(
+        self,
+        world_from_view: Pose | Matrix,
+        view: View | None = None,
+        *,
+        at_ns: int | None = None,
+        fill: Fill = "far",
+        max_age_s: float = 0.5,
+    ) -> DepthView | None:
+        """Show the newest result from another pose, such as an eye's at display time.
+
+        Any thread may call it; it never waits for the network, and takes a few milliseconds. An
+        earlier result fills what the newest one does not see; see :func:`vergence.reproject`.
+
+        Parameters
+        ----------
+        world_from_view
+            The pose to see from, in the session's axes and metres; a matrix is [3, 4] or [4, 4].
+        view
+            The camera to see with; default: the rectified left camera.
+        at_ns
+            The time to show, on the clock of ``capture_ns``; default: now.
+        fill
+            What to give pixels that no result saw: ``"far"`` or ``"none"``.
+        max_age_s
+            The greatest age of the newest result, in seconds.
+
+        Returns
+        -------
+        DepthView | None
+            None if there is no result of at most that age.
+
+        Raises
+        ------
+        BadPose
+            The pose is not finite or no rigid transform, or the frames were sent without poses.
+        """
+        if isinstance(world_from_view, np.ndarray):
+            world_from_view = Pose.from_matrix(world_from_view)
+        return self._responses.recent.depth_at(
+            world_from_view, view, at_ns=at_ns, fill=fill, max_age_s=max_age_s
+        )
 
     def submit(
         self,

@@ -1,5 +1,6 @@
 """Depth at another pose: what a camera there would see, and nothing that nobody saw."""
 
+import asyncio
 import math
 from typing import Any
 
@@ -8,8 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vergence import DepthResult, DepthView, View, reproject
+from tests.support.frames import RIG as FRAME_RIG
+from tests.support.session_frames import step
+from vergence import DepthClient, DepthResult, DepthView, OutputFormat, View, reproject
 from vergence.depth_formats import d16, depth_from_d16, webxr
+from vergence.recent import RecentResults
 from vergence.reprojection import Fill
 from vergence_proto.errors import BadCalibration, BadPose
 from vergence_proto.geometry import Axes, Pose, RectifiedRig
@@ -239,3 +243,44 @@ def test_a_view_exports_its_depth() -> None:
     assert isinstance(seen, DepthView)
     np.testing.assert_allclose(depth_from_d16(seen.d16()), 2.0, rtol=1e-3)
     assert (seen.webxr() == 2000).all()
+
+
+def at(capture_ns: int) -> DepthResult:
+    return DepthResult(
+        frame_id=capture_ns + 1,
+        capture_ns=capture_ns,
+        rig=RIG,
+        disparity_px=RIG.disparity_from_depth(wall(2.0)),
+        world_from_left=AT_REST,
+    )
+
+
+@given(gaps_ns=st.lists(st.integers(1, 400_000_000), min_size=1, max_size=200))
+def test_a_session_keeps_a_handful_of_results_whatever_the_rate(gaps_ns: list[int]) -> None:
+    recent, now_ns = RecentResults(), 0
+    for gap_ns in gaps_ns:
+        now_ns += gap_ns
+        recent.add(at(now_ns))
+        assert len(recent.kept) <= 6
+        assert all(now_ns - each.capture_ns <= 1_300_000_000 for each in recent.kept)
+    assert recent.latest is not None
+    assert recent.latest.capture_ns == now_ns
+
+
+async def test_a_session_shows_its_newest_result_from_any_thread(client: DepthClient) -> None:
+    output = OutputFormat(sigma=True)
+    async with client.open_session(FRAME_RIG, output=output, axes=Axes.OPENXR) as session:
+        assert session.latest is None
+        assert session.depth_at(AT_REST) is None
+        result = await step(session, 3)
+        assert session.latest is result
+        pose = result.world_from_left
+        assert pose is not None
+        seen = await asyncio.to_thread(session.depth_at, pose, at_ns=result.capture_ns + 10**8)
+        assert seen is not None
+        np.testing.assert_allclose(seen.depth_m, result.depth_m, rtol=1e-3)
+        assert seen.sigma_m is not None
+        assert math.isclose(seen.age_s, 0.1)
+        assert session.depth_at(pose, at_ns=result.capture_ns + 6 * 10**8) is None
+        late = session.depth_at(pose.matrix, at_ns=result.capture_ns + 6 * 10**8, max_age_s=1)
+        assert late is not None
