@@ -18,7 +18,7 @@ from vergence.reprojection import DepthView, Fill, View
 from vergence.results import DepthResult, Drops, SessionEvent
 from vergence.session import DepthSession, WorldFromLeft
 from vergence_proto.geometry import Axes, Matrix, Pose, RectifiedRig
-from vergence_proto.types import Delivery, ImageEncoding, OutputFormat, StereoRig
+from vergence_proto.types import Delivery, ImageEncoding, OutputFormat, PoseSample, StereoRig
 
 Value = TypeVar("Value")
 
@@ -145,7 +145,7 @@ class BlockingSession:
 
     def depth_at(
         self,
-        world_from_view: Pose | Matrix,
+        world_from_view: Pose | PoseSample | Matrix,
         view: View | None = None,
         *,
         at_ns: int | None = None,

@@ -156,7 +156,7 @@ class DepthSession:
 
     def depth_at(
         self,
-        world_from_view: Pose | Matrix,
+        world_from_view: Pose | PoseSample | Matrix,
         view: View | None = None,
         *,
         at_ns: int | None = None,
@@ -193,6 +193,8 @@ class DepthSession:
         """
         if isinstance(world_from_view, np.ndarray):
             world_from_view = Pose.from_matrix(world_from_view)
+        elif isinstance(world_from_view, PoseSample):
+            world_from_view = world_from_view.world_from_left
         return self._responses.recent.depth_at(
             world_from_view, view, at_ns=at_ns, fill=fill, max_age_s=max_age_s
         )
