@@ -23,114 +23,26 @@ raises are those of :mod:`vergence_proto.errors`; :class:`NotOpen` and :class:`C
 the client's own.
 """
 
-from vergence.blocking import BlockingClient, BlockingSession, depth
-from vergence.client import DEFAULT_SERVER, DepthClient
-from vergence.errors import NotOpen
-from vergence.info import ModelInfo, ServerInfo, StreamInfo
-from vergence.reprojection import DepthView, View, reproject
-from vergence.results import DepthResult, Drops, EventKind, SessionEvent
-from vergence.session import DepthSession
-from vergence.transports.base import ConnectionLost
-from vergence_proto.errors import (
-    BadCalibration,
-    BadImage,
-    BadPose,
-    BadSequence,
-    BadShape,
-    DepthError,
-    Draining,
-    ErrorCode,
-    FrameOutOfOrder,
-    FrameStale,
-    FrameTooLarge,
-    ModelChanged,
-    ModelFailed,
-    NonFinite,
-    NotReady,
-    QueueFull,
-    Quota,
-    SequenceNotDone,
-    StateMemory,
-    StreamExists,
-    StreamExpired,
-    StreamLimit,
-    Superseded,
-    UnknownSequence,
-    UnknownStream,
-    UploadTooLarge,
-)
-from vergence_proto.geometry import Axes, Pose, RectifiedRig
-from vergence_proto.types import (
-    Delivery,
-    DisparityMap,
-    Distortion,
-    ImageEncoding,
-    Intrinsics,
-    Origin,
-    OutputFormat,
-    PlaneEncoding,
-    PoseSample,
-    StereoRig,
-    Timings,
-)
+from importlib import import_module
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "DEFAULT_SERVER",
-    "Axes",
-    "BadCalibration",
-    "BadImage",
-    "BadPose",
-    "BadSequence",
-    "BadShape",
-    "BlockingClient",
-    "BlockingSession",
-    "ConnectionLost",
-    "Delivery",
-    "DepthClient",
-    "DepthError",
-    "DepthResult",
-    "DepthSession",
-    "DepthView",
-    "DisparityMap",
-    "Distortion",
-    "Draining",
-    "Drops",
-    "ErrorCode",
-    "EventKind",
-    "FrameOutOfOrder",
-    "FrameStale",
-    "FrameTooLarge",
-    "ImageEncoding",
-    "Intrinsics",
-    "ModelChanged",
-    "ModelFailed",
-    "ModelInfo",
-    "NonFinite",
-    "NotOpen",
-    "NotReady",
-    "Origin",
-    "OutputFormat",
-    "PlaneEncoding",
-    "Pose",
-    "PoseSample",
-    "QueueFull",
-    "Quota",
-    "RectifiedRig",
-    "SequenceNotDone",
-    "ServerInfo",
-    "SessionEvent",
-    "StateMemory",
-    "StereoRig",
-    "StreamExists",
-    "StreamExpired",
-    "StreamInfo",
-    "StreamLimit",
-    "Superseded",
-    "Timings",
-    "UnknownSequence",
-    "UnknownStream",
-    "UploadTooLarge",
-    "View",
-    "depth",
-    "reproject",
-]
+if TYPE_CHECKING:
+    from vergence import public
+    from vergence.public import *  # noqa: F403  its list is ours
+
+    __all__ = public.__all__
+    __version__: str
+    """The version of the installed package."""
+else:
+    # The names are loaded when the first of them is used: gRPC, NumPy and OpenCV would take most of
+    # the time in which `vergence --help` answers.
+    def __getattr__(name):
+        if name == "__version__":
+            return import_module("importlib.metadata").version("vergence")
+        names = vars(import_module("vergence.public"))
+        if name == "__all__" or name in names["__all__"]:
+            return names[name]
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+    def __dir__():
+        return [*globals(), *import_module("vergence.public").__all__]

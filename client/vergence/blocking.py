@@ -11,12 +11,13 @@ from typing import Any, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from vergence.client import DEFAULT_SERVER, DepthClient
+from vergence.client import DepthClient
 from vergence.errors import NotOpen
 from vergence.info import ModelInfo, ServerInfo, StreamInfo
 from vergence.reprojection import DepthView, Fill, View
 from vergence.results import DepthResult, Drops, SessionEvent
 from vergence.session import DepthSession, WorldFromLeft
+from vergence.transports.addresses import DEFAULT_SERVER
 from vergence_proto.geometry import Axes, Matrix, Pose, RectifiedRig
 from vergence_proto.types import Delivery, ImageEncoding, OutputFormat, PoseSample, StereoRig
 

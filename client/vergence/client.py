@@ -9,15 +9,12 @@ from vergence.info import ServerInfo, StreamInfo
 from vergence.info_codec import server_info_from_proto, stream_info_from_proto
 from vergence.results import SessionEvent
 from vergence.session import DepthSession, SessionSetup
-from vergence.transports.addresses import connector, on_this_machine
+from vergence.transports.addresses import DEFAULT_SERVER, connector, on_this_machine
 from vergence.transports.base import Transport
 from vergence_proto import codec
 from vergence_proto.geometry import Axes, RectifiedRig
 from vergence_proto.types import Delivery, ImageEncoding, OutputFormat, StereoRig, checked_stream_id
 from vergence_proto.v1 import depth_pb2 as pb
-
-DEFAULT_SERVER = "grpc://127.0.0.1:50051"
-"""The address of a server on this machine with its default port."""
 
 
 class DepthClient:

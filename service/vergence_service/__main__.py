@@ -1,31 +1,14 @@
-"""The command ``vergence serve``, also ``python -m vergence_service``."""
+"""The command ``vergence serve``, also ``python -m vergence_service``.
 
-import asyncio
-import logging
-import sys
+The server is imported when it starts: ``vergence --help`` lists this command without it.
+"""
+
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from vergence_proto.model_io import ManifestError
-from vergence_service.app.server import Running
-from vergence_service.app.server import serve as serve_until_stopped
-from vergence_service.inference.providers import ProviderUnavailable
-from vergence_service.malloc import keep_freed_memory
-from vergence_service.settings import SettingsError, load_settings
-from vergence_service.transports.errors import ExtraMissing, PortTaken, ZenohUnreachable
-
-# Errors that an operator can fix. They are reported in one line, without a traceback.
-_OPERATOR_ERRORS = (
-    SettingsError,
-    ManifestError,
-    ProviderUnavailable,
-    PortTaken,
-    ExtraMissing,
-    ZenohUnreachable,
-    FileNotFoundError,
-)
+from vergence_proto.extras import how_to_install
 
 
 def serve(
@@ -65,28 +48,19 @@ def serve(
         "model.threads": threads,
     }
     try:
-        settings = load_settings(
-            config=config, flags={key: value for key, value in flags.items() if value is not None}
-        )
-        if print_config:
-            typer.echo(settings.to_toml(), nl=False)
-            return
-        logging.basicConfig(
-            level=settings.log_level.upper(),
-            format="%(asctime)s %(levelname)s %(name)s %(message)s",
-        )
-        keep_freed_memory()
-        asyncio.run(serve_until_stopped(settings, on_serving=_announce))
-    except _OPERATOR_ERRORS as error:
-        typer.echo(f"vergence serve: {error}", err=True)
-        raise typer.Exit(2) from None
-
-
-def _announce(server: Running) -> None:
-    zenoh = f" zenoh={server.zenoh.endpoint}" if server.zenoh else ""
-    typer.echo(f"listening grpc={server.grpc_address} http={server.http_address}{zenoh}")
-    sys.stdout.flush()
+        from vergence_service.app.command import run_server
+    except ModuleNotFoundError as error:
+        hint = f"needs {error.name}, which is not installed; install it: {how_to_install('server')}"
+        typer.echo(f"vergence serve {hint}", err=True)
+        raise typer.Exit(1) from None
+    run_server(flags, config=config, print_config=print_config)
 
 
 if __name__ == "__main__":
-    typer.run(serve)
+    program = typer.Typer(
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+    program.command()(serve)
+    program()

@@ -2,8 +2,12 @@
 
 import subprocess
 import sys
+from importlib import metadata
+
+import pytest
 
 import vergence
+from vergence import public
 from vergence_proto import errors
 
 # What a headset or a robot must not have to load, or even install.
@@ -13,10 +17,10 @@ HEAVY = {"fastapi", "onnxruntime", "pydantic", "rich", "torch", "typer", "uvicor
 def test_the_public_list_is_sorted_and_complete() -> None:
     defined = {
         name
-        for name, value in vars(vergence).items()
+        for name, value in vars(public).items()
         if not name.startswith("_") and getattr(value, "__module__", None)
     }
-    constants = {name for name in vars(vergence) if name.isupper()}
+    constants = {name for name in vars(public) if name.isupper()}
     assert set(vergence.__all__) == defined | constants
     groups = [
         [name for name in vergence.__all__ if name.isupper()],
@@ -26,13 +30,24 @@ def test_the_public_list_is_sorted_and_complete() -> None:
     assert vergence.__all__ == [name for group in groups for name in sorted(group)]
 
 
+def test_a_public_name_is_that_of_its_module_and_another_is_an_error() -> None:
+    assert vergence.DepthClient is public.DepthClient
+    assert set(vergence.__all__) <= set(dir(vergence))
+    assert vergence.__version__ == metadata.version("vergence")
+    with pytest.raises(AttributeError, match="no attribute 'DephtClient'"):
+        vergence.DephtClient  # type: ignore[attr-defined]  # noqa: B018
+
+
 def test_every_error_that_a_server_raises_is_public() -> None:
     raised = {error.__name__ for error in errors.ERROR_CLASSES.values()}
     assert raised <= set(vergence.__all__)
 
 
 def test_the_import_is_light() -> None:
-    command = "import sys, vergence; print(*{name.partition('.')[0] for name in sys.modules})"
+    command = (
+        "import sys, vergence; vergence.depth; "
+        "print(*{name.partition('.')[0] for name in sys.modules})"
+    )
     loaded = subprocess.run(
         [sys.executable, "-c", command], capture_output=True, text=True, check=True
     ).stdout.split()

@@ -2,6 +2,8 @@
 
 import sys
 
+from vergence_proto.extras import how_to_install
+
 _NEEDED = {"httpx", "rich", "typer"}
 
 
@@ -9,14 +11,15 @@ def main() -> None:
     """Entry point of the console script."""
     try:
         from vergence.cli.app import run_program
-    except ModuleNotFoundError as error:
+
+        run_program()
+    except ModuleNotFoundError as error:  # a command imports what it needs when it is called
         if error.name is None or error.name.partition(".")[0] not in _NEEDED:
             raise
         sys.exit(
             f"The vergence command needs {error.name}, which the thin client leaves out. "
-            "Install it with: pip install 'vergence[cli]'"
+            f"Install it with: {how_to_install('cli')}"
         )
-    run_program()
 
 
 if __name__ == "__main__":

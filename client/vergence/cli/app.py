@@ -1,49 +1,57 @@
-"""The commands of ``vergence`` and their options."""
+"""The commands of ``vergence`` and their options.
 
-import asyncio
-from collections.abc import Callable
+A command imports what it needs when it is called, so that ``--help`` answers at once.
+"""
+
+from collections.abc import Callable, Coroutine
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
-from rich.console import Console
 
-from vergence.cli.batch import batch
-from vergence.cli.demo import bundled_sample, demo
-from vergence.cli.doctor import doctor
 from vergence.cli.errors import CliError
-from vergence.cli.run import run
-from vergence.client import DEFAULT_SERVER, DepthClient
+from vergence.transports.addresses import DEFAULT_SERVER, connector
 from vergence_proto.errors import DepthError
 from vergence_proto.jobs import Output, ResultFormat
 
-_HELP = {"help_option_names": ["-h", "--help"]}
+if TYPE_CHECKING:
+    from rich.console import Console
+
+Value = TypeVar("Value")
 
 app: typer.Typer = typer.Typer(
     help="Live stereo depth over the network.",
     no_args_is_help=True,
-    add_completion=False,
+    rich_markup_mode="markdown",  # it joins the lines of a paragraph
     pretty_exceptions_enable=False,
-    context_settings=_HELP,
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
-
-# Commands of other installed packages are loaded when they are called: the imports of a server
-# would slow every command down, or break it if they are missing.
-_CONTRIBUTED = "vergence.commands"
-_ABOUT = {"serve": "Serve depth over gRPC, with health and metrics over HTTP."}
-
 
 JsonOption = Annotated[
     Path | None, typer.Option("--json", help="Write the figures of the table to this file.")
 ]
 
 
+def _await(work: Coroutine[Any, Any, Value]) -> Value:
+    import asyncio
+
+    return asyncio.run(work)
+
+
+def _console() -> "Console":
+    from rich.console import Console
+
+    return Console()
+
+
 def run_program() -> None:
     """Run the command line; an error is one line on stderr and the exit code."""
     try:
-        app()
+        app(prog_name="vergence")
     except (CliError, DepthError, OSError) as error:  # OSError: a file cannot be written
+        from rich.console import Console
+
         Console(stderr=True, soft_wrap=True, highlight=False).print(
             f"vergence: {error}", style="red", markup=False
         )
@@ -59,7 +67,7 @@ def _print_version(wanted: bool) -> None:
 def _checked_server(server: str | None) -> str | None:
     if server is not None:
         try:
-            DepthClient(server)
+            connector(server)
         except ValueError as error:
             raise typer.BadParameter(str(error)) from None
     return server
@@ -83,8 +91,10 @@ def _demo(
     json: JsonOption = None,
 ) -> None:
     """Start a server, stream a sample through it, and draw the result."""
+    from vergence.cli.demo import bundled_sample, demo
+
     text = source or bundled_sample()
-    asyncio.run(demo(text, frames=frames, out=out, json=json, console=Console()))
+    _await(demo(text, frames=frames, out=out, json=json, console=_console()))
 
 
 @app.command("run")
@@ -117,7 +127,9 @@ def _run(
     The files are 16-bit PNG in KITTI's convention (x256, 0 = no value): 0000.png, 0001.png, ...
     for a sequence, disp.png for a pair.
     """
-    asyncio.run(
+    from vergence.cli.run import run
+
+    _await(
         run(
             source,
             server=server,
@@ -126,7 +138,7 @@ def _run(
             iterations=iterations,
             pictures=pictures,
             json=json,
-            console=Console(),
+            console=_console(),
         )
     )
 
@@ -157,7 +169,9 @@ def _batch(
     json: JsonOption = None,
 ) -> None:
     """Upload sequences, wait for the server to process them, and download the results."""
-    asyncio.run(
+    from vergence.cli.batch import batch
+
+    _await(
         batch(
             paths,
             server=server,
@@ -169,7 +183,7 @@ def _batch(
                 "metrics": metrics,
             },
             json=json,
-            console=Console(),
+            console=_console(),
         )
     )
 
@@ -184,32 +198,26 @@ def _doctor(
     ] = DEFAULT_SERVER,
 ) -> None:
     """Report what is installed, what is missing, and whether a server answers."""
-    if not asyncio.run(doctor(server, Console())):
+    from vergence.cli.doctor import doctor
+
+    if not _await(doctor(server, _console())):
         raise typer.Exit(1)
 
 
-def _forwarding_to(entry: metadata.EntryPoint) -> Callable[[typer.Context], None]:
-    def forward(context: typer.Context) -> None:
-        try:
-            command = entry.load()
-        except ModuleNotFoundError as error:
-            raise CliError(
-                f"vergence {entry.name} needs {error.name}, which is not installed; "
-                "install it with: pip install 'vergence[server]'"
-            ) from None
-        contributed = typer.Typer(
-            add_completion=False, pretty_exceptions_enable=False, context_settings=_HELP
-        )
-        contributed.command()(command)
-        contributed(args=context.args, prog_name=f"vergence {entry.name}")
+def _contributed(entry: metadata.EntryPoint) -> Callable[..., None]:
+    """Load the command of another package; if that fails, return a command that says why."""
+    try:
+        command: Callable[..., None] = entry.load()
+    except ModuleNotFoundError as error:
+        missing = error.name
 
-    return forward
+        def report() -> None:
+            raise CliError(f"vergence {entry.name} needs {missing}, which is not installed")
+
+        return report
+    return command
 
 
-for _entry in metadata.entry_points(group=_CONTRIBUTED):
-    app.command(
-        _entry.name,
-        help=_ABOUT.get(_entry.name, f"From {_entry.module}."),
-        add_help_option=False,  # its own help knows its options
-        context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
-    )(_forwarding_to(_entry))
+# The server's command. Its module imports the server when the command is called.
+for _entry in metadata.entry_points(group="vergence.commands"):
+    app.command(_entry.name)(_contributed(_entry))

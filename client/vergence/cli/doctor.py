@@ -16,12 +16,13 @@ from rich.text import Text
 
 from vergence.client import DepthClient
 from vergence_proto.errors import DepthError
+from vergence_proto.extras import Extra, how_to_install
 from vergence_proto.instruction_set import UNKNOWN, instruction_set
 from vergence_proto.model_io import ManifestError, load_model_card
 
-# The packages of each extra; the empty name is the base install.
-_PACKAGES = {
-    "": ("grpcio", "numpy", "opencv-python-headless", "protobuf"),
+# The packages of each extra, and of the base install.
+_PACKAGES: dict[Extra | None, tuple[str, ...]] = {
+    None: ("grpcio", "numpy", "opencv-python-headless", "protobuf"),
     "server": ("fastapi", "grpcio-health-checking", "onnxruntime", "prometheus-client", "uvicorn"),
     "zenoh": ("eclipse-zenoh",),
     "train": ("torch", "onnx", "onnxscript"),
@@ -81,7 +82,7 @@ def _packages() -> Iterator[Finding]:
         package = f"vergence[{extra}]" if extra else "vergence"
         if missing:
             verdict = Verdict.NOTE if extra else Verdict.BAD
-            advice = f"without {', '.join(missing)}: pip install '{package}'"
+            advice = f"without {', '.join(missing)}: {how_to_install(extra)}"
             yield Finding(verdict, package, advice)
         else:
             yield Finding(Verdict.GOOD, package, ", ".join(found))
@@ -103,7 +104,7 @@ def _ports() -> Iterator[Finding]:
 def _weights() -> Finding:
     spec = importlib.util.find_spec("vergence_models")
     if spec is None or spec.origin is None:
-        return Finding(Verdict.NOTE, "weights", "not installed: pip install 'vergence[server]'")
+        return Finding(Verdict.NOTE, "weights", f"not installed: {how_to_install('server')}")
     directory = Path(spec.origin).parent / "weights"
     try:
         card = load_model_card(directory, _DEFAULT_MODEL)

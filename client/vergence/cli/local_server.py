@@ -13,6 +13,7 @@ from typing import IO, Literal
 from rich.console import Console
 
 from vergence.cli.errors import CliError
+from vergence_proto.extras import how_to_install
 
 _READY = re.compile(r"listening grpc=(\S+) http=(\S+)")
 _START_TIMEOUT_S = 60.0  # loading and warming a model up takes seconds on a small machine
@@ -29,7 +30,7 @@ async def local_server(
     """
     if importlib.util.find_spec("vergence_service") is None:
         raise CliError(
-            "the server is not installed here; install it with: pip install 'vergence[server]', "
+            f"the server is not installed here; install it with: {how_to_install('server')}, "
             "or name a running one with --server HOST:PORT"
         )
     with (

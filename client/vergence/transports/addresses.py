@@ -4,11 +4,17 @@ import ipaddress
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 from urllib.parse import parse_qs, urlsplit
 
-from vergence.transports.base import Transport
-from vergence.transports.grpc import GrpcTransport
+from vergence_proto.extras import how_to_install
 from vergence_proto.zenoh.keys import DEFAULT_NAMESPACE
+
+if TYPE_CHECKING:  # the commands check addresses before they need a transport
+    from vergence.transports.base import Transport
+
+DEFAULT_SERVER = "grpc://127.0.0.1:50051"
+"""The address of a server on this machine with its default port."""
 
 _EXPECTED = (
     "expected a server as grpc://HOST:PORT, http://HOST:PORT or "
@@ -16,13 +22,15 @@ _EXPECTED = (
 )
 
 
-def connector(server: str) -> Callable[[], Transport]:
+def connector(server: str) -> "Callable[[], Transport]":
     """Return a function that makes the transport; call it in the event loop that will use it.
 
     ``zenoh+tls://`` and the like name the link, which is TCP by default. Raises ValueError.
     """
     scheme, separator, address = server.rpartition("://")
     if scheme == ("grpc" if separator else "") and _is_place(address):
+        from vergence.transports.grpc import GrpcTransport
+
         return partial(GrpcTransport, address)
     if scheme in ("http", "https") and _is_place(address):
         return _http_connector(server)
@@ -47,7 +55,7 @@ def on_this_machine(server: str) -> bool:
         return host == "localhost"
 
 
-def _zenoh_connector(server: str, link: str) -> Callable[[], Transport]:
+def _zenoh_connector(server: str, link: str) -> "Callable[[], Transport]":
     parts = urlsplit(server)
     options = parse_qs(parts.query, keep_blank_values=True)
     files = options.pop("config", [])
@@ -57,7 +65,7 @@ def _zenoh_connector(server: str, link: str) -> Callable[[], Transport]:
         from vergence.transports.zenoh import ZenohTransport
     except ImportError:
         raise ValueError(
-            f"{server} needs Zenoh, which is not installed here: pip install 'vergence[zenoh]'"
+            f"{server} needs Zenoh, which is not installed here: {how_to_install('zenoh')}"
         ) from None
     return partial(
         ZenohTransport,
@@ -67,12 +75,12 @@ def _zenoh_connector(server: str, link: str) -> Callable[[], Transport]:
     )
 
 
-def _http_connector(server: str) -> Callable[[], Transport]:
+def _http_connector(server: str) -> "Callable[[], Transport]":
     try:
         from vergence.transports.http import HttpTransport
     except ImportError:
         raise ValueError(
-            f"{server} needs httpx, which is not installed here: pip install 'vergence[cli]'"
+            f"{server} needs httpx, which is not installed here: {how_to_install('cli')}"
         ) from None
     return partial(HttpTransport, server)
 

@@ -1,5 +1,7 @@
 """Errors that keep a transport from starting, each one sentence for the operator."""
 
+from vergence_proto.extras import Extra, how_to_install
+
 
 class PortTaken(OSError):
     """The server cannot listen on an address."""
@@ -14,8 +16,8 @@ class PortTaken(OSError):
 class ExtraMissing(ImportError):
     """A setting needs a package that is not installed."""
 
-    def __init__(self, what: str, extra: str) -> None:
-        super().__init__(f"{what} is not installed; install it: pip install 'vergence[{extra}]'")
+    def __init__(self, what: str, extra: Extra) -> None:
+        super().__init__(f"{what} is not installed; install it: {how_to_install(extra)}")
 
 
 class ZenohUnreachable(OSError):

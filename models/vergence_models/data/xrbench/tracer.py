@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from vergence_models.data.patterns import noise, pattern
 from vergence_models.data.xrbench.meshes import Matrix, Mesh
 from vergence_models.data.xrbench.things import SPECULAR, Finish, Room, Surface
+from vergence_proto.extras import how_to_install
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -271,7 +272,7 @@ def _mitsuba(variant: str | None) -> ModuleType:
     try:
         import mitsuba
     except ImportError:
-        raise NoRenderer("Mitsuba 3 is not installed: pip install 'vergence[bench]'") from None
+        raise NoRenderer(f"Mitsuba 3 is not installed: {how_to_install('bench')}") from None
     name = variant or "llvm_ad_rgb"
     if name not in VARIANTS:
         raise NoRenderer(f"no variant {name!r}; there are {', '.join(VARIANTS)}")

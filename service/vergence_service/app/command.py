@@ -1,0 +1,55 @@
+"""Run the server as a command: settings, logging, and errors in one line."""
+
+import asyncio
+import logging
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from vergence_proto.model_io import ManifestError
+from vergence_service.app.server import Running, serve
+from vergence_service.inference.providers import ProviderUnavailable
+from vergence_service.malloc import keep_freed_memory
+from vergence_service.settings import SettingsError, load_settings
+from vergence_service.transports.errors import ExtraMissing, PortTaken, ZenohUnreachable
+
+# Errors that an operator can fix. They are reported in one line, without a traceback.
+_OPERATOR_ERRORS = (
+    SettingsError,
+    ManifestError,
+    ProviderUnavailable,
+    PortTaken,
+    ExtraMissing,
+    ZenohUnreachable,
+    FileNotFoundError,
+)
+
+
+def run_server(flags: Mapping[str, Any], *, config: Path | None, print_config: bool) -> None:
+    """Serve until SIGTERM or SIGINT, or print the settings. An operator's error is exit code 2.
+
+    ``flags`` are settings by key; None is a flag that was not given.
+    """
+    try:
+        settings = load_settings(
+            config=config, flags={key: value for key, value in flags.items() if value is not None}
+        )
+        if print_config:
+            sys.stdout.write(settings.to_toml())
+            return
+        logging.basicConfig(
+            level=settings.log_level.upper(),
+            format="%(asctime)s %(levelname)s %(name)s %(message)s",
+        )
+        keep_freed_memory()
+        asyncio.run(serve(settings, on_serving=_announce))
+    except _OPERATOR_ERRORS as error:
+        sys.stderr.write(f"vergence serve: {error}\n")
+        raise SystemExit(2) from None
+
+
+def _announce(server: Running) -> None:
+    zenoh = f" zenoh={server.zenoh.endpoint}" if server.zenoh else ""
+    sys.stdout.write(f"listening grpc={server.grpc_address} http={server.http_address}{zenoh}\n")
+    sys.stdout.flush()
