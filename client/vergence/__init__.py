@@ -18,7 +18,8 @@ A moving camera, live: one task submits frames, another reads results::
             async for result in session:
                 print(result.depth_m.shape, result.age_s)
 
-Everything public is in ``__all__``; the modules behind it may change. The errors that a server
+Everything public is in ``__all__``, :mod:`vergence.ros` and :mod:`vergence.depth_formats`; the
+other modules may change. The errors that a server
 raises are those of :mod:`vergence_proto.errors`; :class:`NotOpen` and :class:`ConnectionLost` are
 the client's own.
 """

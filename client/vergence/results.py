@@ -3,6 +3,10 @@
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+import numpy as np
+from numpy.typing import NDArray
+
+from vergence_proto.errors import BadPose
 from vergence_proto.geometry import Axes
 from vergence_proto.types import DisparityMap
 
@@ -44,6 +48,41 @@ class DepthResult(DisparityMap):
     """The drops of the session until this result."""
     axes: Axes = Axes.OPENCV
     """The axes of ``world_from_left``: those of the session."""
+
+    def points_m(self, *, world: bool = False) -> NDArray[np.float32]:
+        """Return the pixels as points in metres, in the axes of the session.
+
+        Parameters
+        ----------
+        world
+            Return world coordinates; the default is coordinates of the rectified left camera.
+
+        Returns
+        -------
+        NDArray[np.float32]
+            [H, W, 3]; NaN where there is no value.
+
+        Raises
+        ------
+        BadPose
+            World coordinates need a pose, and the result has none.
+        """
+        if world and self.world_from_left is None:
+            raise BadPose(
+                f"expected a result with a pose, and frame {self.frame_id} has none; "
+                "submit frames with poses to get points of the world"
+            )
+        depth_m, rig = self.depth_m, self.rig
+        height, width = depth_m.shape
+        points = np.empty((height, width, 3), np.float32)
+        points[..., 0] = (np.arange(width, dtype=np.float32) - rig.cx_left) / rig.fx * depth_m
+        points[..., 1] = (np.arange(height, dtype=np.float32) - rig.cy)[:, None] / rig.fy * depth_m
+        points[..., 2] = depth_m
+        self_from_opencv = np.array(self.axes.value, np.float32).T
+        points = points @ self_from_opencv.T
+        if world and self.world_from_left is not None:
+            points = self.world_from_left.apply(points.astype(np.float64)).astype(np.float32)
+        return points
 
 
 class EventKind(StrEnum):

@@ -161,6 +161,9 @@ class Axes(Enum):
     """x right, y up, z forward; left-handed."""
     NED = ((0, 1, 0), (0, 0, 1), (1, 0, 0))
     """x forward, y right, z down; the axes of aircraft and drones."""
+    ROS = ((0, -1, 0), (0, 0, -1), (1, 0, 0))
+    """x forward, y left, z up; the body axes of ROS (REP 103). Its optical frames have the axes of
+    :attr:`OPENCV`."""
 
     def to_opencv(self, pose: Pose) -> Pose:
         """Convert a pose stated in these axes to OpenCV axes; the motion is the same."""

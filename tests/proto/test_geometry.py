@@ -110,6 +110,7 @@ class TestAxes:
             pytest.param(Axes.OPENXR, (1, 2, -3), id="x right, y up, z back"),
             pytest.param(Axes.UNITY, (1, 2, 3), id="x right, y up, z forward"),
             pytest.param(Axes.NED, (3, 1, -2), id="x forward, y right, z down"),
+            pytest.param(Axes.ROS, (3, -1, 2), id="x forward, y left, z up"),
         ],
     )
     def test_the_same_place_in_each_convention(
@@ -132,6 +133,9 @@ class TestAxes:
             # North east down: about +z (yaw) turns right; about +y (pitch) looks up.
             pytest.param(Axes.NED, (0, 0, 1), (1, 0, 0), id="ned about z: right"),
             pytest.param(Axes.NED, (0, 1, 0), (0, -1, 0), id="ned about y: up"),
+            # REP 103, right-handed, z up: about +z (yaw) turns left; about +y (pitch) looks down.
+            pytest.param(Axes.ROS, (0, 0, 1), (-1, 0, 0), id="ros about z: left"),
+            pytest.param(Axes.ROS, (0, 1, 0), (0, 1, 0), id="ros about y: down"),
         ],
     )
     def test_where_a_quarter_turn_looks(

@@ -16,6 +16,7 @@ README = Path(__file__).parents[2] / "proto" / "README.md"
 # Each word for a direction, in OpenCV axes.
 DIRECTIONS = {
     "right": (1, 0, 0),
+    "left": (-1, 0, 0),
     "down": (0, 1, 0),
     "up": (0, -1, 0),
     "forward": (0, 0, 1),

@@ -18,6 +18,7 @@ AXES = {
     pb.AXES_OPENXR: Axes.OPENXR,
     pb.AXES_UNITY: Axes.UNITY,
     pb.AXES_NED: Axes.NED,
+    pb.AXES_ROS: Axes.ROS,
 }
 DISTORTION = {
     pb.DISTORTION_UNSPECIFIED: Distortion.NONE,

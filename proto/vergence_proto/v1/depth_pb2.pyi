@@ -61,6 +61,7 @@ class Axes(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     AXES_OPENXR: _ClassVar[Axes]
     AXES_UNITY: _ClassVar[Axes]
     AXES_NED: _ClassVar[Axes]
+    AXES_ROS: _ClassVar[Axes]
 
 class Distortion(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -102,6 +103,7 @@ AXES_OPENCV: Axes
 AXES_OPENXR: Axes
 AXES_UNITY: Axes
 AXES_NED: Axes
+AXES_ROS: Axes
 DISTORTION_UNSPECIFIED: Distortion
 DISTORTION_NONE: Distortion
 DISTORTION_BROWN_CONRADY: Distortion
