@@ -40,7 +40,6 @@ from vergence_proto.instruction_set import instruction_set
 from vergence_proto.types import StereoRig
 from vergence_service.inference.model import RecurrentState, Step, StereoView
 from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
-from vergence_service.jobs.sources import without_truth
 
 LIVE_HZ = 15.0
 SEQUENCES = 2  # in the queue at once
@@ -152,7 +151,7 @@ def p95_ms(ages_s: list[float]) -> float:
 
 
 async def measure(args: argparse.Namespace) -> dict[str, float]:
-    source = without_truth(open_source(args.source))
+    source = open_source(args.source).without_truth()
     frames = list(source)
     bare = BareLoop(source.rig, args.threads)
     rounds: list[tuple[float, float, float]] = []

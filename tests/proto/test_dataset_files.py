@@ -68,6 +68,27 @@ class TestPfm:
         trees.write_pfm_by_hand(tmp_path / "a.pfm", trees.a_disparity(), order)
         np.testing.assert_array_equal(read_pfm(tmp_path / "a.pfm"), trees.a_disparity())
 
+    @pytest.mark.parametrize(
+        "header",
+        [
+            b"Pf\r\n24 16\r\n-1.0\r\n",
+            b"Pf\n# a comment\n24 16\n# and another\n-0.0039\n",
+            b"Pf 24\n16 -1e0\n",
+            b"Pf\n24 16\n-1\r\n",
+        ],
+        ids=["CR LF", "comments", "one line", "mixed"],
+    )
+    def test_headers_vary(self, header: bytes, tmp_path: Path) -> None:
+        values = trees.a_disparity()
+        (tmp_path / "a.pfm").write_bytes(header + values[::-1].astype("<f4").tobytes())
+        np.testing.assert_array_equal(read_pfm(tmp_path / "a.pfm"), values)
+
+    def test_an_explicit_plus_is_big_endian_and_padding_is_no_data(self, tmp_path: Path) -> None:
+        values = trees.a_disparity()
+        big = values[::-1].astype(">f4").tobytes()
+        (tmp_path / "a.pfm").write_bytes(b"Pf\n24 16\n+1.0\n" + big + b"\0\0\n")
+        np.testing.assert_array_equal(read_pfm(tmp_path / "a.pfm"), values)
+
     def test_opencv_reads_what_is_written(self, tmp_path: Path) -> None:
         values = np.nan_to_num(trees.a_disparity())
         write_pfm(tmp_path / "a.pfm", values)
@@ -80,7 +101,7 @@ class TestPfm:
             pytest.param(b"P5\n2 2\n255\n1234", "expected a PFM", id="another format"),
             pytest.param(b"PF\n1 1\n-1.0\n" + bytes(12), "colour", id="colour"),
             pytest.param(b"Pf\n2 2\n-1.0\n" + bytes(15), "needs 16 bytes", id="cut short"),
-            pytest.param(b"Pf\n2 2\n-1.0\n" + bytes(17), "needs 16 bytes", id="too long"),
+            pytest.param(b"Pf\n2 2\n-1.0\n" + bytes(16) + b"\1", "needs 16", id="too long"),
             pytest.param(b"", "expected a PFM", id="empty"),
             pytest.param(b"Pf\n2 2\n--\n" + bytes(16), "expected a PFM", id="no scale"),
         ],

@@ -57,16 +57,14 @@ VERGENCE = [
     ("negative focal length", _calib(fx=-1), "calib.json: focal lengths must be positive"),
     ("another size", _calib(width=640), "left.png: expected 640x16 as its calibration says"),
     ("frames a second of zero", _calib(fps=0), "calib.json: expected a positive fps"),
-    ("no right image", _without("frame_0001_right.png"), "frame_0001_right: not found as .png"),
-    ("a gap in the numbers", _without("frame_0000_left.png"), "frame_0000_left: not found"),
+    ("no right image", _without("frame_0001_right.png"), "frame_0001_right.png: not found"),
+    ("no left image", _without("frame_0000_left.png"), "frame_0000_left.png: not found"),
     ("a small right image", _image("frame_0001_right.png", 20, 16), "right.png: expected 24x16"),
     ("half an image", _cut("frame_0001_left.png"), "frame_0001_left.png: the PNG of"),
     ("text as an image", _writing("frame_0001_left.png", "hm"), "frame_0001_left.png: 2 bytes"),
-    ("too few poses", _writing("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0"), "expected 3 poses"),
     ("a short pose", _writing("poses.txt", "1 0 0"), "poses.txt, line 1: expected 12 numbers"),
     ("a pose of words", _writing("poses.txt", "north " * 12), "poses.txt, line 1: could not"),
     ("no rotation", _writing("poses.txt", "1 " * 12), "poses.txt, line 1: expected a rotation"),
-    ("a nan position", _writing("poses.txt", "1 0 0 nan 0 1 0 0 0 0 1 0"), "line 1: expected a"),
     ("half a truth", _cut("frame_0000_gt.npz"), "frame_0000_gt.npz: expected a readable .npz"),
     ("truth without disp", _truth(d=np.zeros(3)), "gt.npz: expected an array 'disp', got d"),
     ("truth in floats", _truth(disp=np.zeros((16, 24))), "expected disp as uint16"),
@@ -87,16 +85,9 @@ KITTI = [
         _replaced("calib.txt", "P2: 20", "P2: 0"),
         "calib.txt, P2:: expected K [I | t]",
     ),
-    ("too few times", _writing("times.txt", "0.0\n0.1"), "times.txt: expected 3 numbers, got 2"),
+    ("two times in a line", _writing("times.txt", "0 0.1\n"), "times.txt, line 1: expected 1"),
     ("no right image", _without("image_3/000001.png"), "image_3/000001.png: not found"),
     ("half an image", _cut("image_2/000001.png"), "000001.png: the PNG of"),
-    (
-        "too few poses",
-        lambda folder: (folder.parent.parent / "poses/00.txt").write_text(
-            "1 0 0 0 0 1 0 0 0 0 1 0"
-        ),
-        "poses/00.txt: expected 3 poses, got 1",
-    ),
 ]
 EUROC = [
     ("no sensor", _without("mav0/cam1/sensor.yaml"), "cam1/sensor.yaml: not found"),
@@ -113,8 +104,12 @@ EUROC = [
         "yaml: brown-conrady",
     ),
     ("another size", _replaced("mav0/cam1/sensor.yaml", "[24", "[25"), "one size"),
-    ("no images", _writing("mav0/cam1/data.csv", "#"), "no timestamp in common"),
-    ("a line of words", _writing("mav0/cam1/data.csv", "soon"), "cam1/data.csv: expected"),
+    (
+        "no images",
+        _writing("mav0/cam1/data.csv", "#"),
+        "no image of cam1 is less than half a frame from",
+    ),
+    ("a line of words", _writing("mav0/cam1/data.csv", "5,a\nsoon"), "cam1/data.csv: expected"),
     (
         "a truth line of words",
         _writing("mav0/state_groundtruth_estimate0/data.csv", "12,a,b"),
@@ -132,20 +127,18 @@ EUROC = [
     ),
     (
         "a truth time of words",
-        _writing("mav0/state_groundtruth_estimate0/data.csv", "soon,1,2,3,2,0,0,0"),
-        "data.csv: expected a timestamp in ns, got 'soon'",
+        _writing("mav0/state_groundtruth_estimate0/data.csv", "5,1,2,3,1,0,0,0\nsoon,1"),
+        "data.csv: expected 'timestamp, p x y z, q w x y z', got 'soon,1'",
     ),
 ]
 TARTANAIR = [
     ("no poses", _without("pose_left.txt"), "P001: expected pose_left.txt or pose_lcam_front.txt"),
-    ("too few poses", _writing("pose_left.txt", "0 0 0 0 0 0 1"), "a pose for each of 3 images"),
     ("a short pose", _writing("pose_left.txt", "0 0 0 1"), "line 1: expected 7 numbers, got 4"),
     ("no unit quaternion", _writing("pose_left.txt", "0 0 0 0 0 0 0"), "line 1: expected a unit"),
-    ("no depth", _without("depth_left/000001_left_depth.npy"), "left_depth.npy: not found"),
     (
         "half a depth",
         _cut("depth_left/000001_left_depth.npy"),
-        "depth.npy: expected a readable .npy",
+        "depth.npy: no readable .npy",
     ),
     (
         "flat depth",

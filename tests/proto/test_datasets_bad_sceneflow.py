@@ -9,8 +9,6 @@ from tests.support.sources import Change, cut, opening
 
 SCENEFLOW = [
     ("half a PFM", "disparity/TRAIN/A/0000/left/0007.pfm", cut, "0007.pfm: 24x16 needs 1536 bytes"),
-    ("no PFM", "disparity/TRAIN/A/0000/left/0007.pfm", Path.unlink, "0007.pfm: not found"),
-    ("no cameras", "camera_data/TRAIN/A/0000/camera_data.txt", Path.unlink, "not found"),
     (
         "empty cameras",
         "camera_data/TRAIN/A/0000/camera_data.txt",

@@ -35,7 +35,7 @@ files that it reads.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vergence_proto.datasets import (
@@ -137,7 +137,7 @@ def open_source(spec: str) -> StereoSource:
     """
     kind, path, options = _parsed(spec)
     try:
-        return DATASETS[kind].open_path(path, **options)
+        return _noted(DATASETS[kind].open_path(path, **options))
     except DatasetError as error:
         found = [each for each in DATASETS[kind].find(path) if each != path]
         if not found:
@@ -157,6 +157,15 @@ def find_sources(spec: str) -> list[str]:
     kind, path, _ = _parsed(spec)
     _, question, options = spec.partition("?")
     return [f"{kind}:{each}{question}{options}" for each in DATASETS[kind].find(path)]
+
+
+def _noted(source: StereoSource) -> StereoSource:
+    """Note that some frames lack the truth that others have."""
+    without = sum(each.read_truth is None for each in source.files)
+    if without in (0, len(source)):
+        return source
+    note = f"{without} of {len(source)} frames have no ground truth"
+    return replace(source, notes=(*source.notes, note))
 
 
 def _parsed(spec: str) -> tuple[str, Path, dict[str, float]]:

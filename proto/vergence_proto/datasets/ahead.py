@@ -1,25 +1,48 @@
 """Read the frames of a source for an event loop, one frame ahead."""
 
 import asyncio
-from collections.abc import AsyncGenerator, Iterator
+from collections.abc import AsyncGenerator, Callable
 
+from vergence_proto.datasets.files import DatasetError
 from vergence_proto.datasets.source import SourceFrame, StereoSource
 
 
 async def read_ahead(
-    source: StereoSource, *, start: int = 0
+    source: StereoSource,
+    *,
+    start: int = 0,
+    on_unreadable: Callable[[int, DatasetError], None] | None = None,
 ) -> AsyncGenerator[tuple[int, SourceFrame], None]:
     """Yield index and frame from ``start`` on; decode the next frame while one is in use.
 
-    Decoding runs in a thread. Raises DatasetError: a file cannot be read.
+    Decoding runs in a thread. If a file is missing or damaged, ``on_unreadable`` gets the frame's
+    index and the error. A frame without its truth is yielded all the same; a frame that lacks an
+    image is left out. Without ``on_unreadable``, raises DatasetError.
     """
-    frames: Iterator[SourceFrame] = (source[index] for index in range(start, len(source)))
-    coming = asyncio.create_task(asyncio.to_thread(next, frames, None))
-    index = start
+
+    def read(index: int) -> tuple[SourceFrame | None, DatasetError | None]:
+        try:
+            return source[index], None
+        except DatasetError as error:
+            if on_unreadable is None:
+                raise
+            try:
+                return source.without_truth()[index], error
+            except DatasetError:
+                return None, error
+
+    count = len(source)
+    coming = asyncio.create_task(asyncio.to_thread(read, start)) if start < count else None
     try:
-        while (frame := await coming) is not None:
-            coming = asyncio.create_task(asyncio.to_thread(next, frames, None))
-            yield index, frame
-            index += 1
+        for index in range(start, count):
+            assert coming is not None  # there is one before each frame
+            (frame, error), coming = await coming, None
+            if index + 1 < count:
+                coming = asyncio.create_task(asyncio.to_thread(read, index + 1))
+            if error is not None and on_unreadable is not None:
+                on_unreadable(index, error)
+            if frame is not None:
+                yield index, frame
     finally:
-        await asyncio.gather(coming, return_exceptions=True)
+        if coming is not None:
+            await asyncio.gather(coming, return_exceptions=True)

@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from vergence_proto.datasets.files import DatasetError, numbers
-from vergence_proto.datasets.listing import found, image_beside, images, read_lines
+from vergence_proto.datasets.files import DatasetError, numbers, read_lines
+from vergence_proto.datasets.listing import found, image_beside, images
 from vergence_proto.datasets.packings import nominal_rig, read_mask, read_scaled, size_of
 from vergence_proto.datasets.source import FrameFiles, StereoSource, Truth, rectified_rig
 from vergence_proto.types import StereoRig
@@ -59,7 +59,7 @@ def open_path(path: Path, *, steps: float = _STEPS_PER_PX) -> StereoSource:
         )
         for left in lefts
     ]
-    rig = _read_rig(path, size_of(lefts[0]))
+    rig = _read_rig(path, size_of(*lefts))
     return StereoSource(path.name, rig, None, files, metric=False)
 
 

@@ -55,7 +55,7 @@ def open_path(path: Path) -> StereoSource:
     lefts = images(path / "camera_00")
     if not lefts:
         raise DatasetError(f"{path / 'camera_00'}: expected images im0.png, im1.png, found none")
-    rig, metric = _read_rig(path / "calib_00-02.xml", size_of(lefts[0]))
+    rig, metric = _read_rig(path / "calib_00-02.xml", size_of(*lefts))
     truth = path / "disp_00.npy"
     files = [
         FrameFiles(

@@ -64,7 +64,7 @@ def open_path(path: Path) -> StereoSource:
     if not lefts:
         raise DatasetError(f"{folder}: expected images {path.name}_<time>.jpg, found none")
     right, disparity = (_beside(folder, kind) for kind in ("right{0}image", "disparity{0}map"))
-    size = size_of(lefts[0])
+    size = size_of(*lefts)
     full = "full-size" in str(folder) or ("half-size" not in str(folder) and size[0] >= _FULL_WIDTH)
     rig, metric = _read_rig(path, "full-image-calib" if full else "half-image-calib", size)
     files = [

@@ -1,6 +1,12 @@
-"""Checked reading of small files, and the error that every reader raises."""
+"""Checked reading of small files, and the error that every reader raises.
 
+Text may be UTF-8 or UTF-16, with or without a byte order mark, and its lines may end with CR LF, as
+Windows writes them.
+"""
+
+import codecs
 import json
+import re
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -11,6 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 JsonObject = Mapping[str, object]
+
+_BYTE_ORDER_MARKS = {
+    codecs.BOM_UTF8: "utf-8-sig",
+    codecs.BOM_UTF32_LE: "utf-32",  # starts like UTF-16, so it comes first
+    codecs.BOM_UTF16_LE: "utf-16",
+    codecs.BOM_UTF16_BE: "utf-16",
+}
+_TRAILING_COMMA = re.compile(r",(\s*[}\]])")  # of lists that were edited by hand
+_NO_TEXT = re.compile("[\x00-\x08\x0e-\x1f]")
 
 
 class DatasetError(ValueError):
@@ -25,11 +40,33 @@ def existing(path: Path, purpose: str) -> Path:
 
 
 def read_text(path: Path, purpose: str) -> str:
-    """Read UTF-8 text. Raises DatasetError: there is no such file, or it is not text."""
+    """Read text: UTF-8, UTF-16 or UTF-32 by its byte order mark, else UTF-8, else Latin-1.
+
+    Raises DatasetError: there is no such file, or it is not text.
+    """
+    data = existing(path, purpose).read_bytes()
+    marked = (name for mark, name in _BYTE_ORDER_MARKS.items() if data.startswith(mark))
+    text = _decoded(data, next(marked, "utf-8"))
+    if text is None or _NO_TEXT.search(text):
+        raise DatasetError(f"{path}: expected text, {purpose}")
+    return text
+
+
+def read_lines(path: Path, purpose: str) -> list[str]:
+    """Read the lines that are neither blank nor a comment (``#``), without surrounding blanks.
+
+    Raises DatasetError: there is no such file, or it is not text.
+    """
+    lines = (line.strip() for line in read_text(path, purpose).splitlines())
+    return [line for line in lines if line and not line.startswith("#")]
+
+
+def _decoded(data: bytes, encoding: str) -> str | None:
     try:
-        return existing(path, purpose).read_text("utf-8")
+        return data.decode(encoding)
     except UnicodeDecodeError:
-        raise DatasetError(f"{path}: expected text, {purpose}") from None
+        # Older editors wrote the degree sign and the like in one byte.
+        return data.decode("latin-1") if encoding == "utf-8" else None
 
 
 def numbers(words: str, count: int | None, origin: str) -> list[float]:
@@ -48,8 +85,9 @@ def numbers(words: str, count: int | None, origin: str) -> list[float]:
 
 def read_object(path: Path, purpose: str) -> JsonObject:
     """Read a JSON object. Raises DatasetError: there is no such file, or it holds none."""
+    text = read_text(path, purpose)
     try:
-        read = json.loads(read_text(path, purpose))
+        read = json.loads(_TRAILING_COMMA.sub(r"\1", text))
     except json.JSONDecodeError as error:
         raise DatasetError(f"{path}: not JSON: {error}") from None
     if not isinstance(read, dict):

@@ -15,7 +15,17 @@ from vergence_proto.types import Image, Plane
 
 # KITTI's development kit: stored = disparity * 256; 0 means no value.
 _PNG_STEPS_PER_PX = np.float32(256)
-_PFM_HEADER = re.compile(rb"(P[fF])\s+(\d+)\s+(\d+)\s+(-?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)\s")
+# Between the words of a header may be a comment; after the last one is one line end.
+_PFM_GAP = rb"(?:\s+(?:#[^\n]*\n\s*)*)"
+_PFM_HEADER = re.compile(
+    rb"(P[fF])"
+    + _PFM_GAP
+    + rb"(\d+)"
+    + _PFM_GAP
+    + rb"(\d+)"
+    + _PFM_GAP
+    + rb"([-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)(?:\r\n|\s)"
+)
 
 
 def read_image(path: Path) -> Image:
@@ -101,12 +111,14 @@ def read_pfm(path: Path) -> Plane:
     if header[1] == b"PF":
         raise DatasetError(f"{path}: expected a one-channel PFM (Pf), got a colour one (PF)")
     width, height, scale = int(header[2]), int(header[3]), float(header[4])
-    if len(data) - header.end() != 4 * width * height:
+    size = 4 * width * height
+    rows, tail = data[header.end() :][:size], data[header.end() + size :]
+    if len(rows) != size or tail.strip(b"\0\r\n "):
         raise DatasetError(
-            f"{path}: {width}x{height} needs {4 * width * height} bytes after the header, "
+            f"{path}: {width}x{height} needs {size} bytes after the header, "
             f"got {len(data) - header.end()}"
         )
-    rows = np.frombuffer(data, "<f4" if scale < 0 else ">f4", offset=header.end())
-    values = rows.reshape(height, width)[::-1].astype(np.float32)
+    stored = np.frombuffer(rows, "<f4" if scale < 0 else ">f4")
+    values = stored.reshape(height, width)[::-1].astype(np.float32)
     values[~np.isfinite(values)] = np.nan
     return values

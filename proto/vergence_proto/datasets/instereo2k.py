@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from vergence_proto.datasets.files import existing
-from vergence_proto.datasets.listing import found
+from vergence_proto.datasets.listing import found, image_beside
 from vergence_proto.datasets.packings import nominal_rig, read_scaled, size_of
 from vergence_proto.datasets.source import FrameFiles, StereoSource, Truth
 
@@ -24,7 +24,7 @@ def find(root: Path) -> list[Path]:
     return [
         path.parent
         for path in found(root, "left_disp.png")
-        if (path.parent / "left.png").is_file() and (path.parent / "right.png").is_file()
+        if all(_image(path.parent, side).is_file() for side in ("left", "right"))
     ]
 
 
@@ -33,15 +33,19 @@ def open_path(path: Path) -> StereoSource:
 
     Raises DatasetError: a file is missing or wrong.
     """
-    left = existing(path / "left.png", "the left image of a pair")
+    left = existing(_image(path, "left"), "the left image of a pair")
     truth = path / "left_disp.png"
     pair = FrameFiles(
         left,
-        existing(path / "right.png", "the right image of a pair"),
+        existing(_image(path, "right"), "the right image of a pair"),
         capture_ns=0,
         read_truth=partial(_truth, truth) if truth.is_file() else None,
     )
     return StereoSource(path.name, nominal_rig(left, size_of(left)), None, [pair], metric=False)
+
+
+def _image(path: Path, side: str) -> Path:
+    return image_beside(Path("any.png"), path, side)
 
 
 def _truth(path: Path) -> Truth:

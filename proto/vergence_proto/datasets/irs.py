@@ -30,8 +30,8 @@ _BASELINE_M = 0.1
 
 def find(root: Path) -> list[Path]:
     """List every scene in or under ``root``."""
-    folders = {path.parent for path in found(root, "l_*.png") if path.stem[2:].isdecimal()}
-    return sorted(folder for folder in folders if images(folder, r"r_\d+"))
+    folders = sorted({path.parent for path in found(root, "l_*.*")})
+    return [each for each in folders if images(each, r"l_\d+") and images(each, r"r_\d+")]
 
 
 def open_path(path: Path) -> StereoSource:
@@ -42,7 +42,7 @@ def open_path(path: Path) -> StereoSource:
     lefts = images(path, r"l_\d+")
     if not lefts:
         raise DatasetError(f"{path}: expected images l_1.png, l_2.png, found none")
-    size = size_of(lefts[0])
+    size = size_of(*lefts)
     own = size == _OWN_SIZE
     rig = nominal_rig(path, size)
     if own:

@@ -8,15 +8,25 @@
     ROOT/poses/00.txt                       sequences 00 to 10: world_from_cam0, 3x4 per line
 
 The files state poses of the first grey camera. A colour camera is offset from it by K^-1 P[:, 3],
-which is composed into its poses. There is no dense truth.
+which is composed into its poses. There is no dense truth. Of a sequence only some frames may be
+there: each has the pose and the time of its number.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from vergence_proto.datasets.files import DatasetError, numbers, read_text
-from vergence_proto.datasets.images import read_image
+from vergence_proto.datasets.files import DatasetError, numbers, read_lines
+from vergence_proto.datasets.listing import (
+    found,
+    image_beside,
+    images,
+    notes_on_poses,
+    number_in,
+    rows_of_frames,
+)
+from vergence_proto.datasets.packings import size_of
 from vergence_proto.datasets.poses import read_matrix_poses
 from vergence_proto.datasets.source import FrameFiles, StereoSource, nominal_ns, rectified_rig
 from vergence_proto.geometry import Matrix, Pose
@@ -29,11 +39,11 @@ _GREY = (0, 1)
 
 def find(root: Path) -> list[Path]:
     """List every sequence in or under ``root``."""
-    return sorted(
+    return [
         path.parent
-        for path in root.rglob("calib.txt")
+        for path in found(root, "calib.txt")
         if (path.parent / "image_0").is_dir() or (path.parent / "image_2").is_dir()
-    )
+    ]
 
 
 def open_path(path: Path) -> StereoSource:
@@ -43,24 +53,27 @@ def open_path(path: Path) -> StereoSource:
     """
     left, right = _COLOUR if (path / f"image_{_COLOUR[0]}").is_dir() else _GREY
     projections = read_projections(path / "calib.txt", "P{}:", (left, right))
-    names = sorted(file.name for file in (path / f"image_{left}").glob("*.png"))
-    if not names:
+    lefts = images(path / f"image_{left}", r"\d+")
+    if not lefts:
         raise DatasetError(f"{path}: expected PNG images in image_{_COLOUR[0]} or image_{_GREY[0]}")
-    times_ns = _times_ns(path / "times.txt", len(names))
+    numbers_of = [number_in(each) for each in lefts]
+    times_ns = _times_ns(path / "times.txt", numbers_of)
     trajectory = path.parent.parent / "poses" / f"{path.name}.txt"
     left_from_cam0 = Pose(np.eye(3), _offset_m(projections[0]))
-    poses: list[Pose | None] = [None] * len(names)
+    poses: list[Pose | None] = [None] * len(lefts)
+    notes: tuple[str, ...] = ()
     if trajectory.exists():
-        poses = [each @ left_from_cam0.inverse() for each in read_matrix_poses(trajectory)]
-    if len(poses) != len(names):
-        raise DatasetError(f"{trajectory}: expected {len(names)} poses, got {len(poses)}")
+        read = rows_of_frames(read_matrix_poses(trajectory), numbers_of)
+        poses = [None if each is None else each @ left_from_cam0.inverse() for each in read]
+        notes = notes_on_poses(trajectory, poses)
     files = [
-        FrameFiles(path / f"image_{left}" / name, path / f"image_{right}" / name, time_ns, pose)
-        for name, time_ns, pose in zip(names, times_ns, poses, strict=True)
+        FrameFiles(
+            each, image_beside(each, path / f"image_{right}", each.stem), time_ns, world_from_left
+        )
+        for each, time_ns, world_from_left in zip(lefts, times_ns, poses, strict=True)
     ]
-    height, width = read_image(files[0].left).shape[:2]
-    rig = rig_from_projections(path / "calib.txt", projections, (width, height))
-    return StereoSource(path.name, rig, _FPS, files)
+    rig = rig_from_projections(path / "calib.txt", projections, size_of(*lefts))
+    return StereoSource(path.name, rig, _FPS, files, notes)
 
 
 def read_projections(path: Path, label: str, cameras: tuple[int, int]) -> tuple[Matrix, Matrix]:
@@ -70,11 +83,11 @@ def read_projections(path: Path, label: str, cameras: tuple[int, int]) -> tuple[
     are no projection.
     """
     lines = dict(
-        line.split(maxsplit=1)
-        for line in read_text(path, "KITTI's camera projections").splitlines()
-        if len(line.split(maxsplit=1)) == 2
+        words
+        for line in read_lines(path, "KITTI's camera projections")
+        if len(words := line.split(maxsplit=1)) == 2
     )
-    found = []
+    projections = []
     for camera in cameras:
         name = label.format(camera)
         if name not in lines:
@@ -82,8 +95,8 @@ def read_projections(path: Path, label: str, cameras: tuple[int, int]) -> tuple[
         projection = np.reshape(numbers(lines[name], 12, f"{path}, {name}"), (3, 4))
         if not (projection[0, 0] > 0 and np.linalg.det(projection[:, :3]) > 0):
             raise DatasetError(f"{path}, {name}: expected K [I | t], got {projection.tolist()}")
-        found.append(projection)
-    return found[0], found[1]
+        projections.append(projection)
+    return projections[0], projections[1]
 
 
 def rig_from_projections(
@@ -111,8 +124,13 @@ def _offset_m(projection: Matrix) -> Matrix:
     return np.linalg.solve(projection[:, :3], projection[:, 3]).astype(np.float64)
 
 
-def _times_ns(path: Path, count: int) -> list[int]:
+def _times_ns(path: Path, frames: Sequence[int]) -> list[int]:
     if not path.exists():
-        return [nominal_ns(index, _FPS) for index in range(count)]
-    times_s = numbers(read_text(path, "seconds, one per line"), count, str(path))
-    return [round(time_s * 1e9) for time_s in times_s]
+        return [nominal_ns(number, _FPS) for number in frames]
+    lines = read_lines(path, "seconds, one per line")
+    times_s = [numbers(line, 1, f"{path}, line {n}")[0] for n, line in enumerate(lines, start=1)]
+    found_s = rows_of_frames(times_s, frames)
+    return [
+        nominal_ns(number, _FPS) if time_s is None else round(time_s * 1e9)
+        for number, time_s in zip(frames, found_s, strict=True)
+    ]

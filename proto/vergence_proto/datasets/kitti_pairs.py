@@ -18,8 +18,10 @@ from pathlib import Path
 
 import numpy as np
 
-from vergence_proto.datasets.images import read_disparity_png, read_image
+from vergence_proto.datasets.images import read_disparity_png
 from vergence_proto.datasets.kitti import read_projections, rig_from_projections
+from vergence_proto.datasets.listing import found, image_beside, images
+from vergence_proto.datasets.packings import size_of
 from vergence_proto.datasets.source import FrameFiles, StereoSource, Truth
 
 
@@ -67,26 +69,27 @@ def open_2015(path: Path) -> StereoSource:
 
 
 def _find(root: Path, edition: _Edition) -> list[Path]:
-    images = root.rglob(f"{edition.left}/*_10.png")
-    return sorted(image.parent.parent / image.stem.removesuffix("_10") for image in images)
+    folders = found(root, edition.left)
+    lefts = (image for folder in folders for image in images(folder, r".*_10"))
+    return [left.parent.parent / left.stem.removesuffix("_10") for left in lefts]
 
 
 def _open(path: Path, edition: _Edition) -> StereoSource:
-    split, name = path.parent, f"{path.name}_10.png"
+    split, stem = path.parent, f"{path.name}_10"
+    name = f"{stem}.png"
     calib = split / edition.calib / f"{path.name}.txt"
-    left = split / edition.left / name
-    height, width = read_image(left).shape[:2]
+    left = image_beside(Path(name), split / edition.left, stem)
     projections = read_projections(calib, edition.label, edition.cameras)
     truth = split / edition.truth / name
     pair = FrameFiles(
         left,
-        split / edition.right / name,
+        image_beside(left, split / edition.right, stem),
         capture_ns=0,
         read_truth=partial(_truth, truth, split / edition.visible_truth / name)
         if truth.exists()
         else None,
     )
-    rig = rig_from_projections(calib, projections, (width, height))
+    rig = rig_from_projections(calib, projections, size_of(left))
     return StereoSource(path.name, rig, None, [pair])
 
 

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vergence_proto.datasets.files import DatasetError, numbers
+from vergence_proto.datasets.files import DatasetError, numbers, read_lines
 from vergence_proto.datasets.kitti import rig_from_projections
 from vergence_proto.datasets.listing import (
     found,
@@ -27,7 +27,6 @@ from vergence_proto.datasets.listing import (
     images,
     number_in,
     read_keyed,
-    read_lines,
 )
 from vergence_proto.datasets.packings import nominal_rig, offsets_from_depth, read_grey, size_of
 from vergence_proto.datasets.poses import checked_pose
@@ -59,7 +58,7 @@ def open_path(path: Path) -> StereoSource:
         raise DatasetError(
             f"{path}: expected images in image_{_COLOUR[0]}/data or image_{_GREY[0]}/data"
         )
-    size = size_of(lefts[0])
+    size = size_of(*lefts)
     calib = next(
         (each for each in (path, path.parent) if (each / "calib_cam_to_cam.txt").is_file()), None
     )

@@ -1,21 +1,29 @@
-"""Folders and text files, with the bytes and names that Windows and macOS add.
+"""Folders and tables, with the names that Windows and macOS add.
 
-A name that starts with a dot and a ``__MACOSX`` folder are no data. A text file may start with a
-byte order mark and end its lines with CR LF.
+A name that starts with a dot and a ``__MACOSX`` folder are no data. The suffix of an image may be
+written in capitals. Links to folders are followed.
 """
 
+import fnmatch
+import os
 import re
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path, PurePath
+from typing import TypeVar
 
-from vergence_proto.datasets.files import DatasetError, existing, numbers
+from vergence_proto.datasets.files import DatasetError, numbers, read_lines
+
+Row = TypeVar("Row")
 
 IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".ppm", ".pgm")
 
 
 def found(root: Path, pattern: str) -> list[Path]:
     """List every data file or folder in or under ``root`` that matches ``pattern``, sorted."""
-    return sorted(path for path in root.rglob(pattern) if _is_data(path.relative_to(root)))
+    name = re.compile(fnmatch.translate(PurePath(pattern).name))
+    below = (path for path in _below(root, (os.path.realpath(root),)) if name.match(path.name))
+    return sorted(path for path in below if path.relative_to(root).match(pattern))
 
 
 def images(folder: Path, name: str = r".*\d") -> list[Path]:
@@ -27,7 +35,7 @@ def images(folder: Path, name: str = r".*\d") -> list[Path]:
         (
             path
             for path in folder.iterdir()
-            if _is_data(Path(path.name))
+            if is_data(path.name)
             and path.suffix.lower() in IMAGES
             and matching.fullmatch(path.stem)
         ),
@@ -38,7 +46,8 @@ def images(folder: Path, name: str = r".*\d") -> list[Path]:
 def image_beside(path: Path, folder: Path, name: str) -> Path:
     """The image ``name`` in ``folder``, with the suffix of ``path`` or any other that is there."""
     own = folder / f"{name}{path.suffix}"
-    others = (folder / f"{name}{suffix}" for suffix in IMAGES)
+    suffixes = (each for suffix in IMAGES for each in (suffix, suffix.upper()))
+    others = (folder / f"{name}{suffix}" for suffix in suffixes)
     return next((each for each in (own, *others) if each.is_file()), own)
 
 
@@ -51,18 +60,6 @@ def number_in(path: Path) -> int:
     if not digits:
         raise DatasetError(f"{path}: expected a name with a frame number, got {path.name!r}")
     return int(digits[-1])
-
-
-def read_lines(path: Path, purpose: str) -> list[str]:
-    """Read the lines that are not blank.
-
-    Raises DatasetError: there is no such file, or it is not text.
-    """
-    try:
-        text = existing(path, purpose).read_bytes().decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise DatasetError(f"{path}: expected text, {purpose}") from None
-    return [line.strip() for line in text.splitlines() if line.strip()]
 
 
 def read_rows(path: Path, count: int, purpose: str) -> list[list[float]]:
@@ -92,8 +89,40 @@ def read_keyed(path: Path, purpose: str, **counts: int) -> Mapping[str, list[flo
     return keyed
 
 
-def _is_data(path: Path) -> bool:
-    return not any(part.startswith(".") or part == "__MACOSX" for part in path.parts)
+def rows_of_frames(rows: Sequence[Row], numbers: Sequence[int]) -> list[Row | None]:
+    """Match the rows of a file with the frames of these numbers; None: no row belongs to a frame.
+
+    As many rows as frames belong to them in order. Otherwise row ``n``, counted from 0, belongs to
+    frame ``n``: of a longer sequence only some frames may be here.
+    """
+    if len(rows) == len(numbers):
+        return list(rows)
+    return [rows[number] if number < len(rows) else None for number in numbers]
+
+
+def notes_on_poses(path: Path, poses: Sequence[object | None]) -> tuple[str, ...]:
+    """Return what a user should know about frames without a pose, though ``path`` has poses."""
+    without = sum(pose is None for pose in poses)
+    if not without:
+        return ()
+    return (f"{path} has no pose for {without} of {len(poses)} frames, which start cold",)
+
+
+def is_data(name: str) -> bool:
+    """Tell whether a file or folder belongs to the data, and was not added by a system."""
+    return not (name.startswith(".") or name == "__MACOSX")
+
+
+def _below(folder: Path, inside: tuple[str, ...]) -> Iterator[Path]:
+    """Yield what is below ``folder``; ``inside`` are the real folders that lead to it."""
+    with suppress(OSError), os.scandir(folder) as entries:  # OSError: a folder of somebody else
+        for entry in entries:
+            if is_data(entry.name):
+                yield Path(entry.path)
+                if entry.is_dir():
+                    real = os.path.realpath(entry.path)
+                    if real not in inside:  # a link may lead back
+                        yield from _below(Path(entry.path), (*inside, real))
 
 
 def _words(name: str) -> list[tuple[str, int]]:

@@ -16,8 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from vergence_proto.datasets.files import DatasetError, numbers, read_text
+from vergence_proto.datasets.files import DatasetError, numbers, read_lines
 from vergence_proto.datasets.images import read_pfm, read_stored_png
+from vergence_proto.datasets.listing import found, image_beside
+from vergence_proto.datasets.packings import offsets_of_either_sign
 from vergence_proto.datasets.source import FrameFiles, StereoSource, Truth, rectified_rig
 from vergence_proto.types import StereoRig
 
@@ -27,9 +29,7 @@ _VISIBLE = 255
 
 def find(root: Path) -> list[Path]:
     """List every scene in or under ``root``."""
-    return sorted(
-        path.parent for path in root.rglob("calib.txt") if (path.parent / "im0.png").exists()
-    )
+    return [path.parent for path in found(root, "calib.txt") if _image(path.parent, 0).is_file()]
 
 
 def open_path(path: Path) -> StereoSource:
@@ -45,17 +45,21 @@ def open_scene(path: Path, *, truth_folder: Path) -> StereoSource:
     names = (truth_folder / name for name in ("disp0.pfm", "disp0GT.pfm"))
     truth = next((each for each in names if each.exists()), None)
     pair = FrameFiles(
-        path / "im0.png",
-        path / "im1.png",
+        _image(path, 0),
+        _image(path, 1),
         capture_ns=0,
         read_truth=partial(_truth, truth, truth_folder / "mask0nocc.png") if truth else None,
     )
     return StereoSource(path.name, _rig(path / "calib.txt"), None, [pair])
 
 
+def _image(path: Path, camera: int) -> Path:
+    return image_beside(Path("any.png"), path, f"im{camera}")
+
+
 def _rig(path: Path) -> StereoRig:
-    text = read_text(path, "Middlebury's calibration")
-    values = dict(line.split("=", 1) for line in text.splitlines() if "=" in line)
+    pairs = (line.partition("=") for line in read_lines(path, "Middlebury's calibration"))
+    values = {key.strip(): value for key, equals, value in pairs if equals}
     for key in ("cam0", "baseline", "width", "height"):
         if key not in values:
             raise DatasetError(f"{path}: expected a line {key}=..., found none")
@@ -78,7 +82,7 @@ def _rig(path: Path) -> StereoRig:
 
 
 def _truth(path: Path, mask_path: Path) -> Truth:
-    offset_px = read_pfm(path)
+    offset_px = offsets_of_either_sign(read_pfm(path))
     if not mask_path.exists():
         return Truth(offset_px)
     mask = read_stored_png(mask_path)

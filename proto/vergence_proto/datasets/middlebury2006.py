@@ -18,8 +18,8 @@ nominal, and lengths are metres only at full size with a dmin.txt.
 from functools import partial
 from pathlib import Path
 
-from vergence_proto.datasets.files import DatasetError, numbers
-from vergence_proto.datasets.listing import found, image_beside, read_lines
+from vergence_proto.datasets.files import DatasetError, numbers, read_lines
+from vergence_proto.datasets.listing import found, image_beside
 from vergence_proto.datasets.packings import nominal_rig, read_scaled, size_of
 from vergence_proto.datasets.source import FrameFiles, StereoSource, Truth, rectified_rig
 from vergence_proto.types import StereoRig

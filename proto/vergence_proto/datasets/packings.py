@@ -15,13 +15,20 @@ from vergence_proto.types import Plane, StereoRig
 _NOMINAL_BASELINE_M = 0.1
 
 
-def size_of(path: Path) -> tuple[int, int]:
-    """Read the width and height of an image.
+def size_of(*paths: Path) -> tuple[int, int]:
+    """Read the width and height of the first image that can be read.
 
-    Raises DatasetError: the file is missing or damaged.
+    Raises DatasetError: all files are missing or damaged; the error is that of the first.
     """
-    height, width = read_image(path).shape[:2]
-    return width, height
+    first: DatasetError | None = None
+    for path in paths:
+        try:
+            height, width = read_image(path).shape[:2]
+        except DatasetError as error:
+            first = first or error
+        else:
+            return width, height
+    raise first or DatasetError("expected an image to read the size of, got none")
 
 
 def nominal_rig(origin: Path, size: tuple[int, int]) -> StereoRig:
@@ -96,16 +103,20 @@ def read_npy(path: Path, purpose: str) -> NDArray[Any]:
     return np.asarray(plane)
 
 
-def known_offsets(values: NDArray[Any]) -> Plane:
-    """Return disparity as positive pixels; NaN where it is 0 or not finite.
+def offsets_of_either_sign(values: NDArray[Any]) -> Plane:
+    """Return u_left - u_right in pixels; NaN where it is not finite.
 
     Some files store u_right - u_left: if no value is positive, the sign is turned.
     """
     offset_px = np.array(values, np.float32)
-    finite = np.isfinite(offset_px)
-    if not (offset_px[finite] > 0).any():
-        offset_px = -offset_px
-    offset_px[~(finite & (offset_px > 0))] = np.nan
+    offset_px[~np.isfinite(offset_px)] = np.nan
+    return offset_px if (offset_px > 0).any() else -offset_px
+
+
+def known_offsets(values: NDArray[Any]) -> Plane:
+    """Return disparity of either sign as positive pixels; NaN where it is 0 or not finite."""
+    offset_px = offsets_of_either_sign(values)
+    offset_px[~(offset_px > 0)] = np.nan
     return offset_px
 
 

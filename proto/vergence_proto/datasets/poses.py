@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from vergence_proto.datasets.files import DatasetError, numbers, read_text
+from vergence_proto.datasets.files import DatasetError, numbers, read_lines
 from vergence_proto.errors import BadPose
 from vergence_proto.geometry import Matrix, Pose
 
@@ -16,20 +16,30 @@ _UNIT_TOLERANCE = 1e-2
 _LONGEST_GAP_NS = 100_000_000
 
 
-def read_matrix_poses(path: Path) -> list[Pose]:
-    """Read ``world_from_camera``, 12 numbers per line, row-major.
+def read_matrix_poses(path: Path) -> list[Pose | None]:
+    """Read ``world_from_camera``, 12 numbers per line, row-major (or 16, with the row 0 0 0 1).
 
+    A pose that its tracker lost (NaN) is None.
     Raises DatasetError: the file is missing, or a line is no rigid transform.
     """
-    text = read_text(path, "one 3x4 camera-to-world matrix per line")
-    lines = [line for line in text.splitlines() if line.strip()]
-    return [
-        checked_pose(
-            np.reshape(numbers(line, 12, f"{path}, line {number}"), (3, 4)),
-            f"{path}, line {number}",
-        )
-        for number, line in enumerate(lines, start=1)
-    ]
+    lines = read_lines(path, "one 3x4 camera-to-world matrix per line")
+    poses = []
+    for number, line in enumerate(lines, start=1):
+        origin = f"{path}, line {number}"
+        row = numbers(line, None, origin)
+        if len(row) not in (12, 16):
+            raise DatasetError(f"{origin}: expected 12 numbers, got {len(row)}")
+        poses.append(tracked_pose(np.reshape(row, (-1, 4)), origin))
+    return poses
+
+
+def tracked_pose(matrix: Matrix, origin: str) -> Pose | None:
+    """Return the pose of a [3, 4] or [4, 4] matrix, None if a number is not finite.
+
+    Trackers write NaN or infinity for a pose that they lost.
+    Raises DatasetError: the matrix is no rigid transform.
+    """
+    return checked_pose(matrix, origin) if np.isfinite(matrix).all() else None
 
 
 def checked_pose(matrix: Matrix, origin: str) -> Pose:

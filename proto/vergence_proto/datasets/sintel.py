@@ -20,7 +20,7 @@ import numpy as np
 
 from vergence_proto.datasets.files import DatasetError, existing
 from vergence_proto.datasets.images import read_stored_png
-from vergence_proto.datasets.listing import found, images, number_in
+from vergence_proto.datasets.listing import found, image_beside, images, number_in
 from vergence_proto.datasets.packings import nominal_rig, read_mask, size_of
 from vergence_proto.datasets.poses import checked_pose
 from vergence_proto.datasets.source import (
@@ -66,7 +66,7 @@ def open_path(path: Path) -> StereoSource:
         for each in found(split / "camdata_left" / scene, "*.cam")
     }
     matrices = [matrix for matrix, _ in cameras.values()]
-    size = size_of(lefts[0])
+    size = size_of(*lefts)
     if matrices:
         k = matrices[0]
         rig = rectified_rig(
@@ -84,11 +84,11 @@ def open_path(path: Path) -> StereoSource:
     files = [
         FrameFiles(
             left,
-            right / left.name,
+            image_beside(left, right, left.stem),
             nominal_ns(index, _FPS),
             cameras[number_in(left)][1] if number_in(left) in cameras else None,
-            partial(_truth, split, Path(scene) / left.name)
-            if (split / "disparities" / scene / left.name).is_file()
+            partial(_truth, split, Path(scene) / f"{left.stem}.png")
+            if (split / "disparities" / scene / f"{left.stem}.png").is_file()
             else None,
         )
         for index, left in enumerate(lefts)

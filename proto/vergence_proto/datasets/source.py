@@ -1,7 +1,7 @@
 """The stereo source that every reader returns, and its frames."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -70,6 +70,8 @@ class StereoSource:
     """Frames per second; None for a single pair, or if the times are unknown."""
     files: Sequence[FrameFiles]
     """The files of each frame, in order."""
+    notes: tuple[str, ...] = ()
+    """What a user should know of this source: frames that are missing, poses that do not fit."""
     metric: bool = True
     """False if lengths are not metres, because the calibration is unknown (and a nominal one is
     used) or in the data set's own units. Disparity is not affected."""
@@ -78,6 +80,10 @@ class StereoSource:
     def is_single_pair(self) -> bool:
         """True for a pair that is no frame of a sequence."""
         return self.fps is None and len(self) == 1
+
+    def without_truth(self) -> "StereoSource":
+        """Return the same frames without their ground truth, which takes time to read."""
+        return replace(self, files=[replace(each, read_truth=None) for each in self.files])
 
     def __len__(self) -> int:
         return len(self.files)

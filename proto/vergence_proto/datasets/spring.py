@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from vergence_proto.datasets.files import DatasetError, existing
 from vergence_proto.datasets.listing import found, image_beside, images, number_in, read_rows
 from vergence_proto.datasets.packings import nominal_rig, size_of
-from vergence_proto.datasets.poses import checked_pose
+from vergence_proto.datasets.poses import tracked_pose
 from vergence_proto.datasets.source import (
     FrameFiles,
     StereoSource,
@@ -57,7 +57,7 @@ def open_path(path: Path) -> StereoSource:
             f"{path / 'frame_left'}: expected images frame_left_%04d.png, found none"
         )
     poses = _read_poses(path / "cam_data" / "extrinsics.txt")
-    rig, metric = _read_rig(path / "cam_data" / "intrinsics.txt", size_of(lefts[0]))
+    rig, metric = _read_rig(path / "cam_data" / "intrinsics.txt", size_of(*lefts))
     files = []
     for index, left in enumerate(lefts):
         digits = left.stem.removeprefix("frame_left_")
@@ -79,10 +79,11 @@ def _read_poses(path: Path) -> dict[int, Pose]:
     if not path.exists():
         return {}
     rows = read_rows(path, 16, "camera_from_world, 16 numbers per line")
-    return {
-        number: checked_pose(np.reshape(row, (4, 4)), f"{path}, line {number}").inverse()
+    poses = {
+        number: tracked_pose(np.reshape(row, (4, 4)), f"{path}, line {number}")
         for number, row in enumerate(rows, start=1)
     }
+    return {number: pose.inverse() for number, pose in poses.items() if pose is not None}
 
 
 def _read_rig(path: Path, size: tuple[int, int]) -> tuple[StereoRig, bool]:

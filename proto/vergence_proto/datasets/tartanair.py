@@ -9,7 +9,7 @@
 
 Each line of poses is "tx ty tz qx qy qz qw", camera to world, with north-east-down axes for both.
 The focal length is 320 px, the centre is at half the size, the baseline is 0.25 m. The data set
-states no times.
+states no times. Of a trajectory only some frames may be there: each has the pose of its number.
 """
 
 from dataclasses import dataclass
@@ -18,8 +18,16 @@ from pathlib import Path
 
 import numpy as np
 
-from vergence_proto.datasets.files import DatasetError, existing, numbers, read_text
-from vergence_proto.datasets.images import read_image, read_stored_png
+from vergence_proto.datasets.files import DatasetError, existing, numbers, read_lines
+from vergence_proto.datasets.images import read_stored_png
+from vergence_proto.datasets.listing import (
+    found,
+    image_beside,
+    images,
+    notes_on_poses,
+    rows_of_frames,
+)
+from vergence_proto.datasets.packings import offsets_from_depth, read_npy, size_of
 from vergence_proto.datasets.poses import checked_orientation
 from vergence_proto.datasets.source import (
     FrameFiles,
@@ -54,7 +62,7 @@ _VERSIONS = (
 
 def find(root: Path) -> list[Path]:
     """List every trajectory in or under ``root``."""
-    return sorted({path.parent for version in _VERSIONS for path in root.rglob(version.poses)})
+    return sorted({path.parent for version in _VERSIONS for path in found(root, version.poses)})
 
 
 def open_path(path: Path) -> StereoSource:
@@ -65,57 +73,56 @@ def open_path(path: Path) -> StereoSource:
     version = next((each for each in _VERSIONS if (path / each.poses).exists()), None)
     if version is None:
         raise DatasetError(f"{path}: expected {' or '.join(each.poses for each in _VERSIONS)}")
-    poses = _read_poses(path / version.poses)
-    lefts = sorted((path / f"image_{version.left}").glob(f"*_{version.left}.png"))
-    if not lefts or len(lefts) != len(poses):
-        raise DatasetError(
-            f"{path / version.poses}: expected a pose for each of {len(lefts)} images in "
-            f"image_{version.left}, got {len(poses)}"
-        )
-    height, width = read_image(lefts[0]).shape[:2]
+    lefts = images(path / f"image_{version.left}", rf"\d+_{version.left}")
+    if not lefts:
+        raise DatasetError(f"{path / f'image_{version.left}'}: expected images, found none")
+    digits = [left.stem.removesuffix(f"_{version.left}") for left in lefts]
+    trajectory = path / version.poses
+    poses = rows_of_frames(_read_poses(trajectory), [int(each) for each in digits])
+    width, height = size_of(*lefts)
     rig = rectified_rig(
         path, (width, height), fx=_FX, cx=width / 2, cy=height / 2, baseline_m=_BASELINE_M
     )
     files = []
-    for index, (left, world_from_left) in enumerate(zip(lefts, poses, strict=True)):
-        number = left.name.removesuffix(f"_{version.left}.png")
-        right = path / f"image_{version.right}" / f"{number}_{version.right}.png"
+    for left, number, world_from_left in zip(lefts, digits, poses, strict=True):
         depth = path / f"depth_{version.left}" / f"{number}{version.depth}"
-        read_truth = partial(_truth, depth) if depth.parent.is_dir() else None
-        files.append(FrameFiles(left, right, nominal_ns(index, None), world_from_left, read_truth))
-    return StereoSource(path.name, rig, None, files)
+        files.append(
+            FrameFiles(
+                left,
+                image_beside(left, path / f"image_{version.right}", f"{number}_{version.right}"),
+                nominal_ns(int(number), None),
+                world_from_left,
+                partial(_truth, depth) if depth.is_file() else None,
+            )
+        )
+    return StereoSource(path.name, rig, None, files, notes_on_poses(trajectory, poses))
 
 
-def _read_poses(path: Path) -> list[Pose]:
-    lines = read_text(path, "tx ty tz qx qy qz qw per line").splitlines()
+def _read_poses(path: Path) -> list[Pose | None]:
+    """Read world_from_left of each line; None where tracking was lost (NaN)."""
+    lines = read_lines(path, "tx ty tz qx qy qz qw per line")
     poses = []
-    for number, line in enumerate((line for line in lines if line.strip()), start=1):
+    for number, line in enumerate(lines, start=1):
         origin = f"{path}, line {number}"
         values = np.array(numbers(line, 7, origin))
-        world_from_left = Pose.from_xyzw(checked_orientation(values[3:], origin), values[:3])
-        poses.append(Axes.NED.to_opencv(world_from_left))
+        world_from_left = None
+        if np.isfinite(values).all():
+            world_from_left = Axes.NED.to_opencv(
+                Pose.from_xyzw(checked_orientation(values[3:], origin), values[:3])
+            )
+        poses.append(world_from_left)
     return poses
 
 
 def _truth(path: Path) -> Truth:
-    depth_m = _read_depth(path)
-    offset_px = np.full(depth_m.shape, np.nan, np.float32)
-    known = np.isfinite(depth_m) & (depth_m > 0)
-    offset_px[known] = _FX * _BASELINE_M / depth_m[known]
-    return Truth(offset_px)
+    return Truth(offsets_from_depth(_read_depth(path), _FX * _BASELINE_M))
 
 
 def _read_depth(path: Path) -> Plane:
     existing(path, "depth in metres")
-    if path.suffix == ".png":
-        stored = read_stored_png(path)
-        if stored.dtype != np.uint8 or stored.ndim != 3 or stored.shape[2] != 4:
-            raise DatasetError(f"{path}: expected depth as an RGBA PNG, got {list(stored.shape)}")
-        return np.ascontiguousarray(stored).view("<f4")[..., 0].astype(np.float32)
-    try:
-        depth_m = np.load(path)
-    except (ValueError, EOFError, OSError) as error:
-        raise DatasetError(f"{path}: expected a readable .npy: {error}") from None
-    if depth_m.ndim != 2:
-        raise DatasetError(f"{path}: expected depth [H, W], got {list(depth_m.shape)}")
-    return np.asarray(depth_m, np.float32)
+    if path.suffix != ".png":
+        return read_npy(path, "depth").astype(np.float32)
+    stored = read_stored_png(path)
+    if stored.dtype != np.uint8 or stored.ndim != 3 or stored.shape[2] != 4:
+        raise DatasetError(f"{path}: expected depth as an RGBA PNG, got {list(stored.shape)}")
+    return np.ascontiguousarray(stored).view("<f4")[..., 0].astype(np.float32)

@@ -4,7 +4,7 @@
 
     calib.json                      fx, fy, cx, cy, baseline_m, width, height (and, where they
                                     differ, cx_right; and fps)
-    frame_0000_left.EXT             png, webp or jpg; numbered from 0 without a gap
+    frame_0000_left.EXT             png, webp, jpg or jpeg, numbered from 0
     frame_0000_right.EXT
     poses.txt                       optional: one 3x4 camera-to-world matrix per line, left camera,
                                     OpenCV axes, metres
@@ -15,7 +15,8 @@
 A pair has ``left.EXT``, ``right.EXT`` and, for truth, ``gt.npz`` with disp float32, NaN unknown.
 Disparities are pixel offsets u_left - u_right. Null intrinsics mean unknown. A nominal camera then
 takes their place: its focal length equals its width (53 degrees), its baseline is 0.1 m. Disparity
-does not depend on it; depth does.
+does not depend on it; depth does. Of a sequence only some frames may be there: each has the pose
+of its number.
 """
 
 from collections.abc import Mapping
@@ -32,6 +33,15 @@ from vergence_proto.datasets.files import (
     object_number,
     read_object,
 )
+from vergence_proto.datasets.listing import (
+    IMAGES,
+    found,
+    image_beside,
+    images,
+    notes_on_poses,
+    rows_of_frames,
+)
+from vergence_proto.datasets.packings import known_offsets, nominal_rig
 from vergence_proto.datasets.poses import read_matrix_poses
 from vergence_proto.datasets.source import (
     FrameFiles,
@@ -40,16 +50,16 @@ from vergence_proto.datasets.source import (
     nominal_ns,
     rectified_rig,
 )
-from vergence_proto.types import Plane, StereoRig
+from vergence_proto.geometry import Pose
+from vergence_proto.types import StereoRig
 
-_EXTENSIONS = (".png", ".webp", ".jpg")
+_FRAME = r"frame_\d+_"
 _TRUTH_STEPS_PER_PX = np.float32(64)
-_NOMINAL_BASELINE_M = 0.1
 
 
 def find(root: Path) -> list[Path]:
     """List every sequence and pair in or under ``root``."""
-    return sorted(path.parent for path in root.rglob("calib.json") if _has_images(path.parent))
+    return [path.parent for path in found(root, "calib.json") if _has_images(path.parent)]
 
 
 def open_path(path: Path) -> StereoSource:
@@ -60,92 +70,83 @@ def open_path(path: Path) -> StereoSource:
     origin = path / "calib.json"
     calib = read_object(origin, "the calibration of a vergence: sequence or pair")
     rig, metric = _rig(origin, calib)
-    if _image(path / "left"):
-        return StereoSource(path.name, rig, None, [_pair(path)], metric)
+    if _image(path, "left").is_file():
+        return StereoSource(path.name, rig, None, [_pair(path)], metric=metric)
     fps = object_number(origin, calib, "fps") if calib.get("fps") is not None else None
     if fps is not None and fps <= 0:
         raise DatasetError(f"{origin}: expected a positive fps, got {fps}")
-    return StereoSource(path.name, rig, fps, _frames(path, rig, fps), metric)
+    files, notes = _frames(path, rig, fps)
+    return StereoSource(path.name, rig, fps, files, notes, metric)
 
 
 def _has_images(path: Path) -> bool:
-    return bool(_image(path / "left") or _image(path / "frame_0000_left"))
+    return _image(path, "left").is_file() or bool(images(path, f"{_FRAME}left"))
 
 
-def _image(stem: Path) -> Path | None:
-    candidates = (stem.with_name(stem.name + extension) for extension in _EXTENSIONS)
-    return next((path for path in candidates if path.is_file()), None)
-
-
-def _image_or_raise(stem: Path) -> Path:
-    found = _image(stem)
-    if found is None:
-        raise DatasetError(f"{stem}: not found as {' or '.join(_EXTENSIONS)}")
-    return found
+def _image(path: Path, name: str) -> Path:
+    return image_beside(Path("any.png"), path, name)
 
 
 def _rig(path: Path, calib: JsonObject) -> tuple[StereoRig, bool]:
     width, height = (int(object_number(path, calib, key)) for key in ("width", "height"))
     if calib.get("fx", 0) is None or calib.get("baseline_m", 0) is None:
-        centre = (width - 1) / 2, (height - 1) / 2
-        nominal = {"fx": width, "cx": centre[0], "cy": centre[1], "baseline_m": _NOMINAL_BASELINE_M}
-        return rectified_rig(path, (width, height), **nominal), False
+        return nominal_rig(path, (width, height)), False
     known = {key: object_number(path, calib, key) for key in ("fx", "cx", "cy", "baseline_m")}
     extra = {key: object_number(path, calib, key) for key in ("fy", "cx_right") if key in calib}
     return rectified_rig(path, (width, height), **known, **extra), True
 
 
 def _pair(path: Path) -> FrameFiles:
-    truth = path / "gt.npz"
+    left, right, truth = _image(path, "left"), _image(path, "right"), path / "gt.npz"
+    if not right.is_file():
+        raise DatasetError(f"{path / 'right'}: not found as {' or '.join(IMAGES)}")
     return FrameFiles(
-        _image_or_raise(path / "left"),
-        _image_or_raise(path / "right"),
+        left,
+        right,
         capture_ns=0,
         read_truth=partial(_pair_truth, truth) if truth.exists() else None,
     )
 
 
-def _frames(path: Path, rig: StereoRig, fps: float | None) -> list[FrameFiles]:
-    stems = {each.stem for each in path.glob("frame_*_left.*")}
+def _frames(
+    path: Path, rig: StereoRig, fps: float | None
+) -> tuple[list[FrameFiles], tuple[str, ...]]:
+    """The frames of which one image is there at least, and notes on what is missing."""
+    stems = {
+        int(each.stem.split("_")[1]): each.stem.rpartition("_")[0]
+        for each in images(path, f"{_FRAME}(left|right)")
+    }
     if not stems:
         raise DatasetError(
             f"{path}: expected frame_0000_left and on, or left and right; found none"
         )
-    count = len(stems)
-    missing = next((k for k in range(count) if f"frame_{k:04d}_left" not in stems), None)
-    if missing is not None:  # a sequence with a gap is damaged; it does not end there
-        raise DatasetError(
-            f"{path}/frame_{missing:04d}_left: not found, but later frames are there"
-        )
+    frames = sorted(stems)
     trajectory = path / "poses.txt"
-    poses = read_matrix_poses(trajectory) if trajectory.exists() else [None] * count
-    if len(poses) != count:
-        raise DatasetError(f"{trajectory}: expected {count} poses, one per frame, got {len(poses)}")
-    frames = []
-    for index, world_from_left in enumerate(poses):
-        stem = path / f"frame_{index:04d}"
-        dense, sparse = Path(f"{stem}_gt.npz"), Path(f"{stem}_ref.npz")
+    poses: list[Pose | None] = [None] * len(frames)
+    notes: tuple[str, ...] = ()
+    if trajectory.exists():
+        rows = rows_of_frames(read_matrix_poses(trajectory), frames)
+        poses = list(rows)
+        notes = notes_on_poses(trajectory, poses)
+    gaps = frames[-1] + 1 - frames[0] - len(frames)
+    if gaps:
+        notes += (f"{path}: {gaps} frames between the first and the last are missing",)
+    files = []
+    for number, world_from_left in zip(frames, poses, strict=True):
+        stem = stems[number]
+        dense, sparse = path / f"{stem}_gt.npz", path / f"{stem}_ref.npz"
         read_truth = None
         if dense.exists():
             read_truth = partial(_dense_truth, dense)
         elif sparse.exists():
             read_truth = partial(_sparse_truth, sparse, (rig.left.height, rig.left.width))
-        frames.append(
-            FrameFiles(
-                _image_or_raise(Path(f"{stem}_left")),
-                _image_or_raise(Path(f"{stem}_right")),
-                nominal_ns(index, fps),
-                world_from_left,
-                read_truth,
-            )
-        )
-    return frames
+        left, right = (_image(path, f"{stem}_{side}") for side in ("left", "right"))
+        files.append(FrameFiles(left, right, nominal_ns(number, fps), world_from_left, read_truth))
+    return files, notes
 
 
 def _pair_truth(path: Path) -> Truth:
-    offset_px: Plane = npz_arrays(path, "disp")["disp"].astype(np.float32)
-    offset_px[~(np.isfinite(offset_px) & (offset_px > 0))] = np.nan
-    return Truth(offset_px)
+    return Truth(known_offsets(npz_arrays(path, "disp")["disp"]))
 
 
 def _dense_truth(path: Path) -> Truth:

@@ -19,7 +19,7 @@ import numpy as np
 from vergence_proto.datasets.files import DatasetError
 from vergence_proto.datasets.listing import found, image_beside, images, number_in, read_rows
 from vergence_proto.datasets.packings import nominal_rig, offsets_from_depth, read_grey, size_of
-from vergence_proto.datasets.poses import checked_pose
+from vergence_proto.datasets.poses import tracked_pose
 from vergence_proto.datasets.source import (
     FrameFiles,
     StereoSource,
@@ -58,7 +58,7 @@ def open_path(path: Path) -> StereoSource:
         raise DatasetError(f"{rgb / 'Camera_0'}: expected images rgb_%05d.jpg, found none")
     text, depth = _archive(path, "textgt"), _archive(path, "depth") / "frames/depth/Camera_0"
     poses = _read_poses(text / "extrinsic.txt")
-    rig, px_m = _read_rig(text / "intrinsic.txt", size_of(lefts[0]))
+    rig, px_m = _read_rig(text / "intrinsic.txt", size_of(*lefts))
     files = []
     for index, left in enumerate(lefts):
         truth = depth / f"{left.stem.replace('rgb', 'depth')}.png"
@@ -88,13 +88,13 @@ def _read_poses(path: Path) -> dict[int, Pose]:
     """Read world_from_left of each frame number."""
     if not path.exists():
         return {}
-    return {
-        int(row[0]): checked_pose(
-            np.reshape(row[2:], (4, 4)), f"{path}, frame {int(row[0])}"
-        ).inverse()
-        for row in read_rows(path, 18, "frame, cameraID and 16 numbers per line")
+    rows = read_rows(path, 18, "frame, cameraID and 16 numbers per line")
+    poses = {
+        int(row[0]): tracked_pose(np.reshape(row[2:], (4, 4)), f"{path}, frame {int(row[0])}")
+        for row in rows
         if row[1] == 0
     }
+    return {number: pose.inverse() for number, pose in poses.items() if pose is not None}
 
 
 def _read_rig(path: Path, size: tuple[int, int]) -> tuple[StereoRig, float | None]:

@@ -15,7 +15,7 @@ from vergence_service.jobs.checkpoints import Checkpoint, read_checkpoint, write
 from vergence_service.jobs.job import Job, JobOptions
 from vergence_service.jobs.progress import JobProgress
 from vergence_service.jobs.results import holds_frames, start_result, write_frame
-from vergence_service.jobs.sources import open_below, sequence_error, without_truth
+from vergence_service.jobs.sources import open_below, sequence_error
 from vergence_service.jobs.stepping import Stepped, step_all
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.stream import StreamConfig
@@ -53,7 +53,7 @@ async def run_job(
     """
     sequence = await asyncio.to_thread(open_below, folder / "input", job.source)
     if not job.options.metrics:
-        sequence = without_truth(sequence)
+        sequence = sequence.without_truth()
     result = folder / "result"
     before = await asyncio.to_thread(_usable_checkpoint, folder, engine.card.weights_sha256)
     start, state = (before.frames, before.state) if before else (0, None)

@@ -3,7 +3,6 @@
 A *source* is text, KIND:PATH, as clients write it. A *sequence* is an opened source.
 """
 
-import dataclasses
 from pathlib import Path
 
 from vergence_proto.datasets import (
@@ -16,12 +15,6 @@ from vergence_proto.datasets import (
 from vergence_proto.errors import BadSequence
 
 _NAMED_AT_MOST = 12
-
-
-def without_truth(sequence: StereoSource) -> StereoSource:
-    """Return the same frames without their ground truth, which takes time to read."""
-    files = [dataclasses.replace(each, read_truth=None) for each in sequence.files]
-    return dataclasses.replace(sequence, files=files)
 
 
 def find_sequence(folder: Path, source: str | None) -> tuple[str, StereoSource]:
