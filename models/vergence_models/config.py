@@ -78,6 +78,9 @@ class TrainingConfig:
     noise_deg: float = 0.3  # largest rotation error of a pose
     noise_m: float = 0.002  # largest translation error of a pose
     clean_share: float = 0.3  # share of clips without the sensor's flaws
+    blinded_share: float = 0.0  # share of clips in which an eye or both see nothing for a while
+    unmatched_share: float = 0.0  # share of clips in which the right eye sees something else
+    repeating_share: float = 0.0  # share of clips with a pattern that repeats along the rows
     reset_share: float = 0.1  # share of frames that lose their state
     cutmix_share: float = 0.1  # share of frames whose state is partly that of another clip
     cold_iterations: int = 4  # most iterations of a frame without a state; the number is random
@@ -115,6 +118,9 @@ LITE_TRAINING = TrainingConfig(
     decay_steps=36_000,
     ema_decay=0.999,
     stretch_share=0.3,
+    blinded_share=0.16,
+    unmatched_share=0.06,
+    repeating_share=0.12,
     reset_share=0.3,
     cold_iterations=6,
 )

@@ -1,20 +1,24 @@
 """``python -m vergence_models.evaluate --json FILE``: the errors of a model and of SGBM.
 
     python -m vergence_models.evaluate --json out.json --data vergence:DIR --pool pool/val
+    python -m vergence_models.evaluate --no-evidence
 
 Every method sees the same frames in the same run. Prints Markdown (also written beside the JSON),
-and with ``--plots`` draws cold-start curves and the calibration of sigma.
+and with ``--plots`` draws cold-start curves and the calibration of sigma. ``--no-evidence`` adds
+the network's confidence in images that do not show the disparity.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 from vergence_models.data.pool import ClipPool
+from vergence_models.evaluation.evidence import SURE, Doubt, doubts_of
 from vergence_models.evaluation.methods import (
     Method,
     sgbm_methods,
@@ -104,8 +108,9 @@ COLUMNS = {
     "p95": "bad 5 %, px",
     "tepe": "TEPE",
     "settled": "settled by frame",
-    "within_50": "in 50 % of sigma",
-    "within_90": "in 90 %",
+    "within_1_sigma": "in 1 sigma, %",
+    "within_2_sigma": "in 2",
+    "within_3_sigma": "in 3",
     "cpu_ms": "CPU ms",
 }
 
@@ -131,6 +136,20 @@ def markdown(results: Results) -> str:
             lines.append(f"| {name} | " + " | ".join(cells) + " |")
         parts.append("\n".join(lines))
     return "\n\n".join(parts) + "\n"
+
+
+def doubt_table(doubts: dict[str, Doubt]) -> str:
+    """The confidence in images without evidence: median, and the share of pixels above SURE."""
+    lines = [
+        "### no evidence",
+        "",
+        f"| input | confidence, cold | in mid-stream | above {SURE}, cold, % | in mid-stream |",
+        "|---|---:|---:|---:|---:|",
+    ]
+    for name, found in doubts.items():
+        cells = (found.cold, found.warm, found.cold_sure_pct, found.warm_sure_pct)
+        lines.append(f"| {name} | " + " | ".join(f"{value:.0f}" for value in cells) + " |")
+    return "\n".join(lines) + "\n"
 
 
 def as_json(results: Results) -> dict[str, object]:
@@ -177,12 +196,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--pool", type=Path, nargs="*", default=[], help="held-out clips")
     parser.add_argument("--clips", type=int, default=32, help="clips of each pool")
     parser.add_argument("--thorough", action="store_true", help="also without and with noisy poses")
+    parser.add_argument("--no-evidence", action="store_true", help="also blank images and the like")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--json", type=Path, help="written with a .md of the same name beside it")
     parser.add_argument("--plots", type=Path, help="folder for PNGs")
     given = parser.parse_args(arguments)
-    if not (given.data or given.pool):
-        parser.error("nothing to evaluate on: name --data KIND:PATH or --pool DIR")
+    if not (given.data or given.pool or given.no_evidence):
+        parser.error("nothing to evaluate on: name --data KIND:PATH, --pool DIR or --no-evidence")
     if given.json:
         given.json.parent.mkdir(parents=True, exist_ok=True)
     try:
@@ -195,10 +215,15 @@ def main(arguments: list[str] | None = None) -> None:
         )
     except (ManifestError, DatasetError, FileNotFoundError) as error:
         sys.exit(f"vergence_models.evaluate: {error}")
-    sys.stdout.write(markdown(results))
+    tables, values = markdown(results), as_json(results)
+    if given.no_evidence:
+        doubts = doubts_of(network)
+        tables += "\n" + doubt_table(doubts)
+        values["no evidence"] = {name: dataclasses.asdict(found) for name, found in doubts.items()}
+    sys.stdout.write(tables)
     if given.json:
-        given.json.write_text(json.dumps(as_json(results), indent=1) + "\n", "utf-8")
-        given.json.with_suffix(".md").write_text(markdown(results), "utf-8")
+        given.json.write_text(json.dumps(values, indent=1) + "\n", "utf-8")
+        given.json.with_suffix(".md").write_text(tables, "utf-8")
     if given.plots:
         draw_plots(results, given.plots)
 

@@ -116,6 +116,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     add("--val", type=Path, nargs="*", default=[], help="folders of held-out clips")
     add("--out", type=Path, required=True, help="folder of the run")
     add("--resume", action="store_true", help="continue the run in --out")
+    add("--start-from", type=Path, metavar="RUN", help="take over another run's weights")
     add("--minutes", type=float, default=math.inf, help="stop this session after so many minutes")
     add("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     add("--workers", type=int, default=0, help="processes that make batches; 0: the main process")
@@ -147,6 +148,12 @@ def main(arguments: list[str] | None = None) -> None:
             sys.exit(f"vergence_models.train: {error}")
     elif (given.out / CHECKPOINT_NAME).exists():
         sys.exit(f"{given.out} already holds a run; add --resume or choose another folder")
+    elif given.start_from is not None:
+        try:
+            missing = trainer.start_from(given.start_from)
+        except RunError as error:
+            sys.exit(f"vergence_models.train: {error}")
+        log.info("untrained: %s", ", ".join(missing) or "nothing")
     given.out.mkdir(parents=True, exist_ok=True)
     words = arguments if arguments is not None else sys.argv[1:]
     trainer.commands.append(shlex.join(["python", "-m", "vergence_models.train", *words]))

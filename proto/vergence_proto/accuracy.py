@@ -144,3 +144,13 @@ def _mean(errors: NDArray[np.float64]) -> float:
 
 def _share_above(errors: NDArray[np.float64], threshold_px: float) -> float:
     return 100 * _mean((errors > threshold_px).astype(np.float64))
+
+
+def confidence_from_sigma(sigma_px: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return the probability of an error below one pixel, times 255, of the same shape.
+
+    The error is modelled as a Laplace distribution, whose expected absolute error is its scale,
+    ``sigma_px``: 40 of 255 is a sigma of 5.9 px.
+    """
+    probability = 1 - np.exp(-1 / np.maximum(sigma_px, np.float32(1e-6)))
+    return np.asarray(np.rint(probability * 255), np.uint8)

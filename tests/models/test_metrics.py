@@ -66,6 +66,8 @@ def test_sigma_of_a_laplace_distribution_is_calibrated() -> None:
     assert found is not None
     assert found["within_50"] == pytest.approx(50, abs=1)
     assert found["within_90"] == pytest.approx(90, abs=1)
+    shares = [found[f"within_{sigmas}_sigma"] for sigmas in (1, 2, 3)]
+    assert shares == pytest.approx([63.2, 86.5, 95.0], abs=1)
     assert found["sigma_over_error"] == pytest.approx(1, abs=0.02)
 
 

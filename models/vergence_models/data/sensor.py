@@ -33,8 +33,9 @@ class SensorConfig:
     defocus: float = 0.35
     motion_blur: float = 0.25
     motion_blur_px: float = 6.0
-    misalignment: float = 0.25  # a vertical shift of the right image
-    misalignment_px: float = 0.5
+    misalignment: float = 0.5  # the right image is rectified by a calibration that is a little off
+    misalignment_px: float = 0.6  # vertical: a shift, and as much by a turn and by a slant
+    offset_px: float = 0.25  # horizontal, standard deviation; no method can see it in the images
     jpeg: float = 0.3
     grey: float = 0.15  # a monochrome pair
 
@@ -66,10 +67,10 @@ class _Recording:
         frames, height, width, _ = shape
         self._rng = rng
         self._noise = noise
-        shifts = happens(config.misalignment)
-        self._shift_px = rng.uniform(-1, 1) * config.misalignment_px if shifts else 0.0
+        off = happens(config.misalignment)
+        self._misaligned = _misaligned(rng, config, height, width) if off else None
         sigma = rng.uniform(0.3, 1.1) if happens(config.defocus) else 0.0
-        self._sigmas_px: list[float] = (sigma * rng.uniform(0.8, 1.2, 2)).tolist()
+        self._sigmas_px: list[float] = (sigma * rng.uniform(0.7, 1.3, 2)).tolist()
         length, angle = rng.uniform(1.5, config.motion_blur_px), rng.uniform(0, np.pi)
         self._streak = _streak(length, angle) if happens(config.motion_blur) else None
         self._falloff = _vignette(height, width, rng.uniform(0.1, 0.6) * happens(config.vignetting))
@@ -90,10 +91,10 @@ class _Recording:
         return torch.from_numpy(np.stack(recorded)).to(frames.device)
 
     def _record(self, image: Image, frame: int, right: bool) -> Image:
-        if right and self._shift_px:
-            move = np.array([[1, 0, 0], [0, 1, self._shift_px]])
+        if right and self._misaligned is not None:
+            size = image.shape[1::-1]
             image = _u8(
-                cv2.warpAffine(image, move, image.shape[1::-1], borderMode=cv2.BORDER_REPLICATE)
+                cv2.warpAffine(image, self._misaligned, size, borderMode=cv2.BORDER_REPLICATE)
             )
         if self._sigmas_px[right] > 0:
             sigma = self._sigmas_px[right]
@@ -117,6 +118,19 @@ class _Recording:
 
 def _u8(image: cv2.typing.MatLike) -> Image:
     return np.asarray(image, np.uint8)
+
+
+def _misaligned(
+    rng: np.random.Generator, config: SensorConfig, height: int, width: int
+) -> NDArray[np.float64]:
+    """Affine map [2, 3] of pixels that a calibration a little off leaves."""
+    shift, turn, slant = rng.uniform(-1, 1, 3) * config.misalignment_px
+    offset, stretch = rng.normal(0, config.offset_px, 2)
+    # Each term but the shifts is nothing in the middle of the image, and that large at its sides.
+    x, y = width / 2, height / 2
+    return np.array(
+        [[1 + stretch / x, 0, offset - stretch], [turn / x, 1 + slant / y, shift - turn - slant]]
+    )
 
 
 def _tone(rng: np.random.Generator, *, spread: float) -> tuple[float, float, NDArray[np.float64]]:

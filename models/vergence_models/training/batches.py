@@ -21,6 +21,7 @@ from vergence_models.config import TrainingConfig
 from vergence_models.data.clips import StereoClips
 from vergence_models.data.pool import ClipPool
 from vergence_models.training.augment import filmed, stretched
+from vergence_models.training.no_evidence import without_evidence
 
 REFRESH_STEPS = 100  # a pool may still be growing
 
@@ -32,7 +33,14 @@ def batch_at(step: int, pool: ClipPool, training: TrainingConfig) -> StereoClips
         random, training.batch, frames=training.frames, reverse=0.5, skip=0.3, flip=0.3
     )
     clips = stretched(clips, random, share=training.stretch_share)
-    return filmed(clips, random, clean_share=training.clean_share)
+    clips = filmed(clips, random, clean_share=training.clean_share)
+    return without_evidence(
+        clips,
+        random,
+        blinded_share=training.blinded_share,
+        unmatched_share=training.unmatched_share,
+        repeating_share=training.repeating_share,
+    )
 
 
 def batches(

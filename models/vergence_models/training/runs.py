@@ -189,6 +189,16 @@ def load_weights(network: AnyNetwork, weights: Mapping[str, Tensor], source: str
     network.load_state_dict(weights)
 
 
+def carry_over(network: AnyNetwork, weights: Mapping[str, Tensor], source: str) -> list[str]:
+    """Load the weights of a run that has fewer parts; returns the names of what it lacks.
+
+    Those stay as the network has them. Raises RunError if a weight has no place in the network.
+    """
+    present = network.state_dict()
+    load_weights(network, {**present, **weights}, source)
+    return sorted(present.keys() - weights.keys())
+
+
 def trained_network(run: Run) -> AnyNetwork:
     """The averaged weights of a run, for inference. Raises RunError."""
     network = build_network(run.network).eval()

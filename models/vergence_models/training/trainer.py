@@ -17,10 +17,12 @@ from vergence_models.config import Config, Precision
 from vergence_models.data.clips import StereoClips
 from vergence_models.networks.base import AnyNetwork, State
 from vergence_models.networks.factory import build_network
+from vergence_models.networks.losses import masked_mean
 from vergence_models.training.camera_motion import perturbed, uvd_transforms
 from vergence_models.training.runs import (
     CHECKPOINT_NAME,
     TrainingProgress,
+    carry_over,
     load_checkpoint,
     load_weights,
     require_same_network,
@@ -143,6 +145,22 @@ class Trainer:
         self.measured = contents["measured"]
         self.commands = contents["story"]["commands"]
 
+    def start_from(self, folder: Path) -> list[str]:
+        """Take over the averaged weights and the story of another run, of fewer parts perhaps.
+
+        The optimizer begins anew, the learning rate goes on by the run's steps. Returns the names
+        of weights that the run lacks, which begin untrained. Raises RunError if its configuration
+        differs.
+        """
+        contents = load_checkpoint(folder)
+        path = folder / CHECKPOINT_NAME
+        require_same_network(contents, self.config, path)
+        missing = carry_over(self.network, contents["average"], str(path))
+        self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
+        self.progress = TrainingProgress(**contents["progress"])
+        self.commands = contents["story"]["commands"]
+        return missing
+
     def autocast(self) -> torch.autocast:
         """Convolutions and matrix products in the precision that was asked for."""
         wanted = self.config.training.precision is Precision.BF16
@@ -215,7 +233,8 @@ class Trainer:
             truth = clips.disparity_px[:, frame]
             frame_loss = estimate.loss(truth, self.config.network.max_disparity_px)
             loss = loss + frame_loss / clips.frames
-            errors_px.append((estimate.disparity.detach() - truth).abs()[truth > 0].mean().item())
+            error = masked_mean((estimate.disparity.detach() - truth).abs(), (truth > 0).float())
+            errors_px.append(error.item())
         return Unrolled(loss, errors_px)
 
     def update(self, loss: Tensor) -> float:

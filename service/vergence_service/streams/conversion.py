@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vergence_proto.accuracy import confidence_from_sigma
 from vergence_proto.errors import BadShape
 from vergence_proto.geometry import Axes, Pose
 from vergence_proto.types import DisparityMap, Origin, Plane, StereoFrame, Timings
@@ -58,7 +58,7 @@ class SteppedFrame:
             rig=self.view.rig,
             disparity_px=_disparity_px(result.offset_px, self.stream.rectifier),
             sigma_px=result.sigma_px if config.output.sigma else None,
-            confidence=_confidence(result.sigma_px) if config.output.confidence else None,
+            confidence=confidence_from_sigma(result.sigma_px) if config.output.confidence else None,
             world_from_left=None if pose is None else config.axes.from_opencv(pose),
             origin=self.origin,
             step_count=result.state.step_count,
@@ -76,12 +76,3 @@ def _disparity_px(offset_px: Plane, rectifier: Rectifier) -> Plane:
         valid &= rectifier.seen
     disparity_px[~valid] = np.nan
     return disparity_px
-
-
-def _confidence(sigma_px: Plane) -> NDArray[np.uint8]:
-    """Return the probability of an error below one pixel, times 255.
-
-    The error is modelled as a Laplace distribution, whose expected absolute error is its scale.
-    """
-    probability: Plane = 1 - np.exp(-1 / np.maximum(sigma_px, np.float32(1e-6)))
-    return np.rint(probability * 255).astype(np.uint8)

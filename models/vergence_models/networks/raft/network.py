@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from vergence_models.config import RaftNetworkConfig
 from vergence_models.networks.base import Estimate, State, StereoNetwork
 from vergence_models.networks.layers import silent
-from vergence_models.networks.losses import doubt_loss, known, lookup_cross_entropy, masked_mean
+from vergence_models.networks.losses import known, lookup_cross_entropy, masked_mean, sigma_loss
 from vergence_models.networks.raft.encoder import Encoder
 from vergence_models.networks.raft.update import (
     CELL_PX,
@@ -66,7 +66,7 @@ class RaftEstimate(Estimate):
         mask = known(truth_px, max_disparity_px)
         error = (self.disparity - truth_px).abs()
         loss = masked_mean(error, mask)
-        loss = loss + 0.1 * masked_mean(doubt_loss(error.detach(), self.sigma), mask)
+        loss = loss + 0.1 * sigma_loss(self.disparity, self.sigma, truth_px, max_disparity_px)
         eighth = truth_px[:, None, 4::8, 4::8]
         mask = known(eighth, max_disparity_px)
         loss = loss + 0.1 * masked_mean((self.first - eighth).abs(), mask)
