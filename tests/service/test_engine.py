@@ -29,6 +29,7 @@ from vergence_service.streams.continuity import ContinuityLimits
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.stream import StreamConfig
 from vergence_service.streams.table import StreamTable
+from vergence_service.threads import Threads
 
 OPENING = StreamConfig(StereoRig.from_rectified(RIG))
 
@@ -289,7 +290,10 @@ async def test_before_the_model_is_loaded_every_opening_is_refused() -> None:
         clock=clock,
         metrics=metrics,
     )
-    async with StepBatcher(model, max_batch=1, clock=clock, metrics=metrics) as batcher:
+    async with (
+        Threads(lanes=1) as threads,
+        StepBatcher(model, max_batch=1, clock=clock, metrics=metrics) as batcher,
+    ):
         engine = DepthEngine(
             streams,
             batcher,
@@ -300,6 +304,7 @@ async def test_before_the_model_is_loaded_every_opening_is_refused() -> None:
             max_pixels=RIG.width * RIG.height,
             clock=clock,
             metrics=metrics,
+            threads=threads,
         )
         with pytest.raises(NotReady, match="loading") as refusal:
             await engine.open("a", OPENING)

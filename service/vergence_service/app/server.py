@@ -20,6 +20,7 @@ from vergence_service.settings import Settings
 from vergence_service.streams.continuity import ContinuityLimits
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.table import StreamTable
+from vergence_service.threads import Threads
 from vergence_service.transports.addresses import format_address
 from vergence_service.transports.grpc.server import DepthServicer, GrpcServer
 from vergence_service.transports.http.app import HttpServer
@@ -81,6 +82,7 @@ async def running(
         metrics=metrics,
     )
     batcher = StepBatcher(model, max_batch=settings.model.max_batch, clock=clock, metrics=metrics)
+    threads = Threads(lanes=model.max_concurrent_steps)
     engine = DepthEngine(
         streams,
         batcher,
@@ -94,6 +96,7 @@ async def running(
         max_pixels=settings.limits.max_pixels,
         clock=clock,
         metrics=metrics,
+        threads=threads,
     )
     max_frame_bytes = settings.limits.max_frame_mib * _MIB
     limits = StreamLimits(
@@ -115,6 +118,7 @@ async def running(
     http_host = settings.http.host or settings.server.host
     # The outermost context ends last: no transport outlives the batcher that it uses.
     async with (
+        threads,
         batcher,
         GrpcServer(
             DepthServicer(unary, open_calls()),

@@ -60,8 +60,10 @@ class _Member:
     open: Callable[[], IO[bytes]]
 
 
-def unpack(archive: Path, folder: Path, limits: ArchiveLimits) -> None:
-    """Unpack into ``folder``. The caller removes the folder if this raises.
+def unpacking(archive: Path, folder: Path, limits: ArchiveLimits) -> Iterator[None]:
+    """Unpack into ``folder``, and yield after each short piece of work.
+
+    The caller removes the folder if this raises or is closed before its end.
 
     Raises BadSequence if the file is not a zip or tar archive, is damaged or encrypted, or contains
     links or names that lead out of the folder. Raises UploadTooLarge if it has more files, bytes or
@@ -75,7 +77,7 @@ def unpack(archive: Path, folder: Path, limits: ArchiveLimits) -> None:
     try:
         for member in members(archive, start):
             budget.take_file(member)
-            _write(member, _target_path(folder, member.name), budget)
+            yield from _writing(member, _target_path(folder, member.name), budget)
     except _DAMAGED as error:
         raise BadSequence(f"expected a complete zip or tar archive: {error}") from None
 
@@ -123,13 +125,15 @@ def _is_bad_part(part: str) -> bool:
     return too_long or part == ".." or not set(part).isdisjoint("\\:\0")
 
 
-def _write(member: _Member, path: Path, budget: _Budget) -> None:
+def _writing(member: _Member, path: Path, budget: _Budget) -> Iterator[None]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with member.open() as source, path.open("xb") as target:
             while chunk := source.read(_CHUNK):
                 budget.take_bytes(len(chunk))
                 target.write(chunk)
+                yield
+        yield
     except (FileExistsError, NotADirectoryError, IsADirectoryError):
         raise BadSequence(f"the archive contains {member.name!r} twice") from None
 

@@ -1,6 +1,5 @@
 """The admission of sequences: limits, checks of the upload, and the end of a job on request."""
 
-import asyncio
 import secrets
 import time
 from collections.abc import AsyncIterator
@@ -9,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-from vergence_proto.datasets import StereoSource
 from vergence_proto.errors import QueueFull, Quota
 from vergence_service.jobs.job import Job, JobOptions
 from vergence_service.jobs.progress import JobStatus
@@ -18,9 +16,10 @@ from vergence_service.jobs.results import result_bytes
 from vergence_service.jobs.run import job_stream_config
 from vergence_service.jobs.sources import find_sequence
 from vergence_service.jobs.store import JobStore, folder_bytes, remove_folder
-from vergence_service.jobs.upload_checks import check_folder
+from vergence_service.jobs.upload_checks import checking_folder
 from vergence_service.jobs.worker import JobWorker
 from vergence_service.streams.engine import DepthEngine
+from vergence_service.threads import to_the_end
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,7 +41,13 @@ class JobQueue:
     """
 
     def __init__(self, engine: DepthEngine, store: JobStore, *, limits: QueueLimits) -> None:
-        self.jobs = JobRegistry(store, keep_s=limits.keep_s, disk_bytes=limits.disk_bytes)
+        self.threads = engine.threads.background
+        self.jobs = JobRegistry(
+            store,
+            keep_s=limits.keep_s,
+            disk_bytes=limits.disk_bytes,
+            background=self.threads,
+        )
         self._engine = engine
         self._store = store
         self._limits = limits
@@ -72,11 +77,11 @@ class JobQueue:
         self._check_room(client)
         self._uploading.append(client)
         try:
-            folder = await asyncio.to_thread(self._store.new_folder)
+            folder = await self.threads.run(self._store.new_folder)
             try:
                 yield folder
             finally:
-                await asyncio.to_thread(remove_folder, folder)
+                await self.threads.run(remove_folder, folder)
         finally:
             self._uploading.remove(client)
 
@@ -107,13 +112,13 @@ class JobQueue:
         UploadTooLarge or QueueFull if it does not fit on the disk, and NotReady or Draining if the
         server accepts no work.
         """
-        limit = self._engine.max_pixels
-        chosen, sequence = await asyncio.to_thread(
-            _checked_sequence, folder / "input", source, max_pixels=limit
+        await self.threads.finish(
+            checking_folder(folder / "input", max_pixels=self._engine.max_pixels)
         )
+        chosen, sequence = await self.threads.run(find_sequence, folder / "input", source)
         # Refuse now what could not be opened when the job runs.
         await self._engine.open_offline(job_stream_config(sequence, options))
-        uploaded = await asyncio.to_thread(folder_bytes, folder)
+        uploaded = await self.threads.run(folder_bytes, folder)
         job = Job(
             job_id=secrets.token_hex(8),
             source=chosen,
@@ -131,12 +136,8 @@ class JobQueue:
     async def delete(self, job_id: str) -> None:
         """Stop a job if it has not ended, and delete all its files. Raises UnknownSequence."""
         self.jobs.hide(job_id)
+        await to_the_end(self._delete(job_id))
+
+    async def _delete(self, job_id: str) -> None:
         await self._worker.cancel(job_id)
         await self.jobs.delete(job_id)
-
-
-def _checked_sequence(
-    folder: Path, source: str | None, *, max_pixels: int
-) -> tuple[str, StereoSource]:
-    check_folder(folder, max_pixels=max_pixels)
-    return find_sequence(folder, source)

@@ -13,6 +13,7 @@ from vergence_proto.jobs import JobState
 from vergence_service.jobs.job import Job
 from vergence_service.jobs.progress import JobProgress, JobStatus
 from vergence_service.jobs.store import JobStore, folder_bytes
+from vergence_service.threads import ThreadPool, to_the_end
 
 # The expected duration of a job before any has run. Clients are asked to retry after it.
 _USUAL_JOB_S = 2.0
@@ -25,8 +26,11 @@ class JobRegistry:
     loop; threads touch the files and the database.
     """
 
-    def __init__(self, store: JobStore, *, keep_s: float, disk_bytes: int) -> None:
+    def __init__(
+        self, store: JobStore, *, keep_s: float, disk_bytes: int, background: ThreadPool
+    ) -> None:
         self._store = store
+        self._background = background
         self._keep_s = keep_s
         self._disk_bytes = disk_bytes
         self._jobs: dict[str, Job] = {}
@@ -37,7 +41,7 @@ class JobRegistry:
 
     async def load(self) -> None:
         """Read the jobs of earlier servers."""
-        jobs = await asyncio.to_thread(self._store.load)
+        jobs = await self._background.run(self._store.load)
         self._jobs = {job.job_id: job for job in jobs}
 
     # Reading.
@@ -123,7 +127,10 @@ class JobRegistry:
 
     async def add(self, folder: Path, job: Job) -> None:
         """Add a job with its uploaded files. When this returns, a crash does not lose the job."""
-        await asyncio.to_thread(self._store.insert, folder, job)
+        await to_the_end(self._add(folder, job))
+
+    async def _add(self, folder: Path, job: Job) -> None:
+        await self._background.run(self._store.insert, folder, job)
         self._jobs[job.job_id] = job
         await self._notify_changed()
 
@@ -142,7 +149,7 @@ class JobRegistry:
 
     async def update(self, job: Job) -> None:
         """Replace the entry of a job, unless it was deleted."""
-        await asyncio.to_thread(self._store.update, job)
+        await self._background.run(self._store.update, job)
         if job.job_id in self._jobs:
             self._jobs[job.job_id] = job
             await self._notify_changed()
@@ -151,11 +158,11 @@ class JobRegistry:
         """Record that a job has ended, and remove the files that it needs no more."""
         result = self._store.folder(job.job_id) / "result"
         done = job.state is JobState.DONE
-        used = await asyncio.to_thread(folder_bytes, result) if done else 0
+        used = await self._background.run(folder_bytes, result) if done else 0
         job = replace(job, finished_s=time.time(), disk_bytes=used)
         await self.update(job)
         # Only now: a server that is killed before the row is written needs the input again.
-        await asyncio.to_thread(self._store.tidy, job)
+        await self._background.run(self._store.tidy, job)
 
     def hide(self, job_id: str) -> None:
         """Make a job unknown to readers at once; :meth:`delete` follows. Raises UnknownSequence."""
@@ -165,7 +172,7 @@ class JobRegistry:
     async def delete(self, job_id: str) -> None:
         """Delete a job with its row and its files."""
         self._jobs.pop(job_id, None)
-        await asyncio.to_thread(self._store.delete, job_id)
+        await self._background.run(self._store.delete, job_id)
         await self._notify_changed()
 
     # Limits of age and disk space.

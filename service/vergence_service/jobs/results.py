@@ -109,10 +109,14 @@ def zip_of(folder: Path, form: ResultFormat, outputs: Collection[Output]) -> Ite
 
 
 def mp4_of(folder: Path, *, fps: float) -> Iterator[bytes]:
-    """Make a film of disparity, and yield it in pieces. Raises CannotEncode before the first."""
+    """Make a film of disparity, and yield it in pieces, which are empty while frames are encoded.
+
+    Raises CannotEncode before the first piece.
+    """
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "disparity.mp4"
-        _write_mp4(path, (frame.offset_px for frame in read_frames(folder)), fps)
+        for _ in _writing_mp4(path, (frame.offset_px for frame in read_frames(folder)), fps):
+            yield b""
         with path.open("rb") as file:
             while chunk := file.read(_CHUNK):
                 yield chunk
@@ -156,7 +160,7 @@ def _npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     return file.getvalue()
 
 
-def _write_mp4(path: Path, frames: Iterator[Plane], fps: float) -> None:
+def _writing_mp4(path: Path, frames: Iterator[Plane], fps: float) -> Iterator[None]:
     writer: cv2.VideoWriter | None = None
     low = high = 0.0
     for offset_px in frames:
@@ -174,6 +178,7 @@ def _write_mp4(path: Path, frames: Iterator[Plane], fps: float) -> None:
         colours = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)
         colours[~known] = 0
         writer.write(colours)
+        yield
     if writer is not None:
         writer.release()
 

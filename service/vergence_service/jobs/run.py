@@ -1,6 +1,5 @@
 """Run one job: step its input to the last frame and write the result to disk."""
 
-import asyncio
 import time
 from collections.abc import AsyncGenerator, AsyncIterable
 from contextlib import aclosing
@@ -19,6 +18,7 @@ from vergence_service.jobs.sources import open_below, sequence_error
 from vergence_service.jobs.stepping import Stepped, step_all
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.stream import StreamConfig
+from vergence_service.threads import ThreadPool
 
 # Frames that are being written while the next ones are stepped.
 _UNWRITTEN = 2
@@ -51,29 +51,25 @@ async def run_job(
     accepts no work; and BadCalibration, FrameTooLarge, BadShape, ModelFailed or NonFinite if a
     frame cannot be stepped.
     """
-    sequence = await asyncio.to_thread(open_below, folder / "input", job.source)
+    background = engine.threads.background
+    sequence = await background.run(open_below, folder / "input", job.source)
     if not job.options.metrics:
         sequence = sequence.without_truth()
     result = folder / "result"
-    before = await asyncio.to_thread(_usable_checkpoint, folder, engine.card.weights_sha256)
+    before = await background.run(_usable_checkpoint, folder, engine.card.weights_sha256)
     start, state = (before.frames, before.state) if before else (0, None)
     measured = list(before.measured) if before else []
     progress.frames_found = progress.frames_done = start
     checkpoint_due_s = time.monotonic() + checkpoint_s
 
     async def write(stepped: Stepped) -> tuple[Stepped, Accuracy | None]:
-        thread = asyncio.ensure_future(asyncio.to_thread(_write_and_measure, result, stepped))
-        try:
-            return stepped, await asyncio.shield(thread)
-        except asyncio.CancelledError:
-            await asyncio.wait([thread])  # a thread cannot be stopped
-            raise
+        return stepped, await background.run(_write_and_measure, result, stepped)
 
     config = job_stream_config(sequence, job.options)
     try:
         async with (
             aclosing(step_all(engine, sequence, config, start=start, state=state)) as steps,
-            aclosing(_started(result, steps)) as started,
+            aclosing(_started(result, steps, background)) as started,
             # No thread writes any more when this is closed. Then the folder can be removed.
             aclosing(in_order(started, write, limit=_UNWRITTEN, cancel_rest=False)) as written,
         ):
@@ -89,7 +85,7 @@ async def run_job(
                         engine.card.weights_sha256,
                         tuple(measured),
                     )
-                    await asyncio.to_thread(write_checkpoint, folder / _CHECKPOINT, checkpoint)
+                    await background.run(write_checkpoint, folder / _CHECKPOINT, checkpoint)
                     checkpoint_due_s = time.monotonic() + checkpoint_s
     except DatasetError as error:
         raise sequence_error(error, folder / "input") from None
@@ -97,11 +93,13 @@ async def run_job(
     return mean if mean.n else None
 
 
-async def _started(result: Path, steps: AsyncIterable[Stepped]) -> AsyncGenerator[Stepped, None]:
+async def _started(
+    result: Path, steps: AsyncIterable[Stepped], background: ThreadPool
+) -> AsyncGenerator[Stepped, None]:
     """Pass the steps on. Empty the result's folder before the first frame of the sequence."""
     async for stepped in steps:
         if stepped.index == 0:
-            await asyncio.to_thread(start_result, result, stepped.disparity.rig)
+            await background.run(start_result, result, stepped.disparity.rig)
         yield stepped
 
 

@@ -49,7 +49,9 @@ async def step_all(
         return Stepped(index, source, disparity, state)
 
     async with (
-        aclosing(read_ahead(sequence, start=start)) as frames,
+        aclosing(
+            read_ahead(sequence, start=start, in_thread=engine.threads.background.run)
+        ) as frames,
         aclosing(in_order(frames, step, limit=_IN_FLIGHT)) as steps,
     ):
         async for stepped in steps:

@@ -4,6 +4,7 @@ An image of a few kilobytes may claim a billion pixels, and decoders trust the c
 """
 
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 
 from vergence_proto.codec.images import image_size
@@ -26,8 +27,8 @@ _REFUSED_KINDS = {
 }
 
 
-def check_folder(folder: Path, *, max_pixels: int) -> None:
-    """Check all files below ``folder``.
+def checking_folder(folder: Path, *, max_pixels: int) -> Iterator[None]:
+    """Check all files below ``folder``, and yield after each.
 
     Raises FrameTooLarge if a file or an image is too large, and BadSequence if it is damaged or of
     an unknown kind.
@@ -39,6 +40,7 @@ def check_folder(folder: Path, *, max_pixels: int) -> None:
             except (BadImage, FrameTooLarge) as error:
                 kind = FrameTooLarge if isinstance(error, FrameTooLarge) else BadSequence
                 raise kind(f"{path.relative_to(folder)}: {error}") from None
+        yield
 
 
 def check_file(path: Path, *, max_pixels: int) -> None:

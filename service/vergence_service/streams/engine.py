@@ -1,6 +1,5 @@
 """The engine: open a stream, step it frame by frame, close it."""
 
-import asyncio
 from collections.abc import Callable, Mapping
 from enum import Enum
 
@@ -30,6 +29,7 @@ from vergence_service.streams.conversion import SteppedFrame, view_from_frame
 from vergence_service.streams.rectify import Rectifier
 from vergence_service.streams.stream import Attachment, Notice, NoticeKind, Stream, StreamConfig
 from vergence_service.streams.table import StreamTable
+from vergence_service.threads import ThreadPool, Threads
 
 
 class _Phase(Enum):
@@ -56,11 +56,13 @@ class DepthEngine:
         max_pixels: int,
         clock: Callable[[], float],
         metrics: Metrics,
+        threads: Threads,
     ) -> None:
         self.streams = streams
         self.card = card
         self.max_pixels = max_pixels
         self.metrics = metrics
+        self.threads = threads
         self._batcher = batcher
         self._iterations = iterations
         self._cold_iterations = cold_iterations
@@ -155,7 +157,9 @@ class DepthEngine:
         """
         stream = self.streams.get(stream_id)
         self.streams.touch(stream)
-        return await self._step(stream, decode, arrived_s=arrived_s, max_age_s=max_age_s)
+        return await self._step(
+            stream, decode, self.threads.live, arrived_s=arrived_s, max_age_s=max_age_s
+        )
 
     async def open_offline(
         self, config: StreamConfig, *, state: RecurrentState | None = None
@@ -182,8 +186,11 @@ class DepthEngine:
         Raises what ``decode`` raises, BadShape or FrameOutOfOrder if the frame is refused,
         ModelFailed, NonFinite and Draining.
         """
-        stepped = await self._step(stream, decode, arrived_s=self._clock(), max_age_s=None)
-        return await asyncio.to_thread(stepped.disparity_map), stepped.result.state
+        background = self.threads.background
+        stepped = await self._step(
+            stream, decode, background, arrived_s=self._clock(), max_age_s=None
+        )
+        return await background.run(stepped.disparity_map), stepped.result.state
 
     async def reset(self, stream_id: str) -> None:
         """Let later frames start without a state. Raises UnknownStream, StreamExpired."""
@@ -235,12 +242,13 @@ class DepthEngine:
             raise FrameTooLarge(
                 f"expected at most {self.max_pixels} pixels per image, got {width}x{height}"
             )
-        return await asyncio.to_thread(Rectifier.of, rig)
+        return await self.threads.background.run(Rectifier.of, rig)
 
     async def _step(
         self,
         stream: Stream,
         decode: Callable[[], StereoFrame],
+        pool: ThreadPool,
         *,
         arrived_s: float,
         max_age_s: float | None,
@@ -251,7 +259,7 @@ class DepthEngine:
             try:
                 started_s = self._clock()
                 skipped = stream.frames_skipped
-                frame, view = await asyncio.to_thread(_decoded_view, decode, stream)
+                frame, view = await pool.run(_decoded_view, decode, stream)
                 decode_s = self._clock() - started_s
                 stream.check_order(frame.frame_id)
                 state, origin = stream.state_before(view, self._limits)

@@ -9,6 +9,7 @@ from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.metrics import Metrics
 from vergence_service.streams.conversion import SteppedFrame
 from vergence_service.streams.stream import Notice, NoticeKind
+from vergence_service.threads import ThreadPool
 
 # One map is encoded and sent while the next is stepped. Beyond that the stepper waits for the
 # client to read, and newer frames displace older ones in the mailbox.
@@ -37,8 +38,10 @@ class Outbox:
         *,
         clock: Callable[[], float],
         metrics: Metrics,
+        threads: ThreadPool,
     ) -> None:
         self._write = write
+        self._threads = threads
         self._clock = clock
         self._metrics = metrics
         self._answers: asyncio.Queue[pb.StreamDepthResponse | SteppedFrame | _Ping | None]
@@ -80,7 +83,7 @@ class Outbox:
         while (answer := await self._answers.get()) is not None:
             match answer:
                 case SteppedFrame():
-                    await self._write(await asyncio.to_thread(self._encoded, answer))
+                    await self._write(await self._threads.run(self._encoded, answer))
                     self._unsent.release()
                 case _Ping(client_ns, arrived_s):
                     hold_ns = int((self._clock() - arrived_s) * 1e9)

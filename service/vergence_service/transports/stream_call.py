@@ -43,7 +43,9 @@ class DepthCall:
         self._client = client
         self._limits = limits
         self._clock = clock
-        self._outbox = Outbox(write, clock=clock, metrics=engine.metrics)
+        self._outbox = Outbox(
+            write, clock=clock, metrics=engine.metrics, threads=engine.threads.live
+        )
         self._reader: asyncio.Task[None] | None = None
         self._stepper: asyncio.Task[None] | None = None
         self._stream: Stream | None = None

@@ -1,6 +1,5 @@
 """The route of /v1/pairs: upload two images, download disparity. curl is enough."""
 
-import asyncio
 import io
 import tempfile
 from enum import StrEnum
@@ -18,6 +17,7 @@ from vergence_proto.types import Delivery, Image, Plane, StereoFrame, StereoRig
 from vergence_service.jobs.upload_checks import check_file
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.stream import StreamConfig
+from vergence_service.threads import ThreadPool
 from vergence_service.transports.http.errors import PROBLEM_RESPONSE
 from vergence_service.transports.http.uploads import (
     FORM_TYPE,
@@ -90,7 +90,8 @@ def pair_routes(engine: DepthEngine, *, limits: UploadLimits) -> APIRouter:
 
         `curl -F left=@left.png -F right=@right.png HOST/v1/pairs -o disparity.png`
         """
-        left, right = await _images(request, limits, max_pixels=engine.max_pixels)
+        background = engine.threads.background
+        left, right = await _images(request, limits, background, max_pixels=engine.max_pixels)
         height, width = left.shape[:2]
         nominal_px = float(width)  # any focal length gives the same disparity
         rig = RectifiedRig(
@@ -116,24 +117,23 @@ def pair_routes(engine: DepthEngine, *, limits: UploadLimits) -> APIRouter:
         frame = StereoFrame(1, 0, left, right)
         disparity, _ = await engine.step_offline(stream, lambda: frame)
         wanted = disparity.depth_m if query.output is PairOutput.DEPTH else disparity.disparity_px
-        return await asyncio.to_thread(_encoded, wanted, query.format)
+        return await background.run(_encoded, wanted, query.format)
 
     return router
 
 
 async def _images(
-    request: Request, limits: UploadLimits, *, max_pixels: int
+    request: Request, limits: UploadLimits, threads: ThreadPool, *, max_pixels: int
 ) -> tuple[Image, Image]:
     if media_type(request) != FORM_TYPE:
         raise BadImage(f"expected a body of {FORM_TYPE} with the files left and right")
     with tempfile.TemporaryDirectory() as scratch:
-        parts = await receive_form(request, Path(scratch), limits)
+        parts = await receive_form(request, Path(scratch), limits, threads)
         if sorted(part.name for part in parts) != ["left", "right"]:
             names = sorted(part.name[:40] for part in parts)
             raise BadImage(f"expected one file left and one file right, got {names}")
         images = {
-            part.name: await asyncio.to_thread(_image, part.path, part.name, max_pixels)
-            for part in parts
+            part.name: await threads.run(_image, part.path, part.name, max_pixels) for part in parts
         }
     left, right = images["left"], images["right"]
     if left.shape != right.shape:

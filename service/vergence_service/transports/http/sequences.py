@@ -18,6 +18,7 @@ from vergence_service.jobs.progress import JobStatus
 from vergence_service.jobs.queue import JobQueue
 from vergence_service.jobs.registry import JobRegistry
 from vergence_service.jobs.results import CannotEncode, mp4_of, zip_of
+from vergence_service.threads import ThreadPool
 from vergence_service.transports.http.errors import PROBLEM_RESPONSE
 from vergence_service.transports.http.uploads import (
     ARCHIVE_TYPES,
@@ -25,6 +26,7 @@ from vergence_service.transports.http.uploads import (
     UploadLimits,
     client_of,
     receive_sequence,
+    while_connected,
 )
 
 _FILM_FPS = 30.0  # frame rate of a film whose sequence does not state one
@@ -164,7 +166,7 @@ def sequence_routes(
     queue: JobQueue, *, model: str, limits: UploadLimits, stopping: asyncio.Event
 ) -> APIRouter:
     """Make the routes. ``stopping`` ends the answers that wait for a job while the server stops."""
-    jobs = queue.jobs
+    jobs, threads = queue.jobs, queue.threads
     router = APIRouter(tags=["sequences"], responses=PROBLEM_RESPONSE)
 
     @router.post(
@@ -188,14 +190,15 @@ def sequence_routes(
         )
         client = client_of(request)
         async with queue.reserve_slot(client) as folder:
-            await receive_sequence(request, folder, limits)
-            status = await queue.accept(folder, query.source, options, client=client)
+            await receive_sequence(request, folder, limits, threads)
+            async with while_connected(request):
+                status = await queue.accept(folder, query.source, options, client=client)
         job_id = status.job.job_id
         if query.wait:
             while not (status := jobs.status(job_id)).job.ended and not stopping.is_set():
                 await jobs.change(within_s=_POLL_EVERY_S)
             if status.job.ended:
-                return await _result(jobs, job_id, query.format)
+                return await _result(jobs, job_id, query.format, threads)
         return JSONResponse(
             SequenceJob.of(status).model_dump(mode="json"),
             status_code=202,
@@ -236,7 +239,7 @@ def sequence_routes(
     )
     async def result(job_id: str, query: Annotated[ResultQuery, Query()]) -> Response:
         """Download the result. It is encoded while it is sent."""
-        return await _result(jobs, job_id, query.format)
+        return await _result(jobs, job_id, query.format, threads)
 
     @router.delete("/v1/sequences/{job_id}", status_code=204)
     async def delete(job_id: str) -> None:
@@ -278,11 +281,15 @@ async def _events(jobs: JobRegistry, job_id: str, stopping: asyncio.Event) -> As
         await jobs.change(within_s=_POLL_EVERY_S)
 
 
-async def _result(jobs: JobRegistry, job_id: str, form: ResultFormat) -> Response:
+async def _result(
+    jobs: JobRegistry, job_id: str, form: ResultFormat, threads: ThreadPool
+) -> Response:
     job, folder = jobs.result(job_id)
-    pieces = _pieces(jobs, job, folder, form)
+    pieces = _pieces(jobs, job, folder, form, threads)
     try:
-        first = await anext(pieces)  # an error of the encoder must come before the answer begins
+        # An error of the encoder must come before the answer begins.
+        while not (first := await anext(pieces)):
+            pass
     except CannotEncode as error:
         raise BadShape(f"format {form}: {error}") from None
     film = form is ResultFormat.MP4
@@ -302,13 +309,14 @@ async def _chained(first: bytes, rest: AsyncGenerator[bytes, None]) -> AsyncIter
 
 
 async def _pieces(
-    jobs: JobRegistry, job: Job, folder: Path, form: ResultFormat
+    jobs: JobRegistry, job: Job, folder: Path, form: ResultFormat, threads: ThreadPool
 ) -> AsyncGenerator[bytes, None]:
     pieces: Iterator[bytes]
     if form is ResultFormat.MP4:
         pieces = mp4_of(folder, fps=job.source_fps or _FILM_FPS)
     else:
         pieces = zip_of(folder, form, job.options.outputs)
-    with jobs.reading(job.job_id):
-        while (piece := await asyncio.to_thread(next, pieces, None)) is not None:
-            yield piece
+    async with aclosing(threads.iterate(pieces)) as taken:
+        with jobs.reading(job.job_id):
+            async for piece in taken:
+                yield piece

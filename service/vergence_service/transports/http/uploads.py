@@ -6,7 +6,8 @@ leaves files only in the folder that the caller provides and removes.
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Iterator, Sequence
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -16,7 +17,8 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 from starlette.requests import ClientDisconnect
 
 from vergence_proto.errors import BadSequence, UploadTooLarge
-from vergence_service.jobs.archives import ArchiveLimits, unpack
+from vergence_service.jobs.archives import ArchiveLimits, unpacking
+from vergence_service.threads import ThreadPool
 from vergence_service.transports.http.forms import FormPart, FormWriter
 
 FORM_TYPE = "multipart/form-data"
@@ -82,39 +84,70 @@ def media_type(request: Request) -> str:
     return request.headers.get("content-type", "").partition(";")[0].strip().lower()
 
 
-async def receive_sequence(request: Request, folder: Path, limits: UploadLimits) -> None:
-    """Write the sequence in the body of a request to ``folder``/input.
+@asynccontextmanager
+async def while_connected(request: Request) -> AsyncIterator[None]:
+    """Cancel the block if the client disconnects, and raise BadSequence. The body must be read."""
+    block, gone = asyncio.current_task(), False
+    assert block is not None
+
+    async def watch() -> None:
+        nonlocal gone
+        while (await request.receive())["type"] != "http.disconnect":
+            pass
+        gone = True
+        block.cancel()
+
+    watching = asyncio.create_task(watch())
+    try:
+        yield
+    except asyncio.CancelledError:
+        if gone and block.uncancel() == 0:
+            raise BadSequence("the client disconnected before its upload was accepted") from None
+        raise
+    finally:
+        watching.cancel()
+        await asyncio.gather(watching, return_exceptions=True)
+
+
+async def receive_sequence(
+    request: Request, folder: Path, limits: UploadLimits, threads: ThreadPool
+) -> None:
+    """Write the sequence in the body of a request to ``folder``/input, in ``threads``.
 
     Raises BadSequence if the body is not an allowed form or archive or is cut off, and
     UploadTooLarge if it exceeds a limit.
     """
     kind = media_type(request)
     if kind == FORM_TYPE:
-        parts = await receive_form(request, folder, limits)
-        await asyncio.to_thread(_sequence_of_parts, parts, folder, limits)
+        parts = await receive_form(request, folder, limits, threads)
+        async with while_connected(request):
+            await threads.finish(_arranging(parts, folder, limits))
     elif kind in ARCHIVE_TYPES:
         archive = folder / "archive"
         with archive.open("wb") as file:
             async for chunk in _chunks(request, limits):
-                await asyncio.to_thread(file.write, chunk)
-        await asyncio.to_thread(_unpacked, archive, folder, limits)
+                await threads.run(file.write, chunk)
+        async with while_connected(request):
+            await threads.finish(_unpacking(archive, folder, limits))
     else:
         raise BadSequence(
             f"expected a body of {FORM_TYPE} or {', '.join(ARCHIVE_TYPES)}, got {kind!r}"
         )
 
 
-async def receive_form(request: Request, folder: Path, limits: UploadLimits) -> list[FormPart]:
+async def receive_form(
+    request: Request, folder: Path, limits: UploadLimits, threads: ThreadPool
+) -> list[FormPart]:
     """Write every part of a form to a file in ``folder``.
 
     Raises BadSequence if the form is damaged or cut off, and UploadTooLarge if it is too large.
     """
     parts = folder / "parts"
-    await asyncio.to_thread(parts.mkdir)
+    await threads.run(parts.mkdir)
     writer = FormWriter(request.headers["content-type"], parts, max_parts=limits.archive.max_files)
     try:
         async for chunk in _chunks(request, limits):
-            await asyncio.to_thread(writer.write, chunk)
+            await threads.run(writer.write, chunk)
         return writer.finish()
     finally:
         writer.close()
@@ -144,22 +177,25 @@ async def _chunks(request: Request, limits: UploadLimits) -> AsyncIterator[bytes
         yield chunk
 
 
-def _unpacked(archive: Path, folder: Path, limits: UploadLimits) -> None:
+def _unpacking(archive: Path, folder: Path, limits: UploadLimits) -> Iterator[None]:
     target = folder / "input"
     target.mkdir()
-    unpack(archive, target, limits.archive)
+    yield from unpacking(archive, target, limits.archive)
     archive.unlink()
 
 
-def _sequence_of_parts(parts: Sequence[FormPart], folder: Path, limits: UploadLimits) -> None:
+def _arranging(parts: Sequence[FormPart], folder: Path, limits: UploadLimits) -> Iterator[None]:
+    """Make ``folder``/input from the parts of a form, and yield after each short piece of work."""
     by_name: dict[str, list[Path]] = {}
     for part in parts:
         by_name.setdefault(part.name, []).append(part.path)
     names = set(by_name)
     if names == {"archive"} and len(parts) == 1:
-        _unpacked(parts[0].path, folder, limits)
+        yield from _unpacking(parts[0].path, folder, limits)
     elif names == {"left", "right", "sequence"} and len(by_name["sequence"]) == 1:
-        _write_layout(folder / "input", by_name["left"], by_name["right"], by_name["sequence"][0])
+        yield from _writing_layout(
+            folder / "input", by_name["left"], by_name["right"], by_name["sequence"][0]
+        )
     else:
         raise BadSequence(
             "expected a form with one file 'archive', or with one JSON 'sequence' and as many "
@@ -167,12 +203,13 @@ def _sequence_of_parts(parts: Sequence[FormPart], folder: Path, limits: UploadLi
         )
     for leftover in (folder / "parts").iterdir():
         leftover.unlink()
+        yield
 
 
-def _write_layout(
+def _writing_layout(
     target: Path, left: Sequence[Path], right: Sequence[Path], sequence: Path
-) -> None:
-    """Write a folder in the project's own layout."""
+) -> Iterator[None]:
+    """Write a folder in the project's own layout, and yield after each image."""
     form = _sequence_form(sequence)
     counts = {"left": len(left), "right": len(right)}
     if form.poses is not None:
@@ -189,6 +226,7 @@ def _write_layout(
     for side, images in (("left", left), ("right", right)):
         for index, image in enumerate(images):
             image.rename(target / f"frame_{index:04d}_{side}.{_extension(image)}")
+            yield
 
 
 def _sequence_form(path: Path) -> SequenceForm:
