@@ -33,9 +33,10 @@ def serve(
     """Serve depth over gRPC, HTTP and, with --zenoh, Zenoh.
 
     Every setting is also an environment variable (VERGENCE_GRPC__PORT) and a key of the file;
-    --print-config lists them. Flags win over variables, and variables over the file. When the
-    server is ready, it prints one line: "listening grpc=HOST:PORT http=HOST:PORT", and with Zenoh
-    also " zenoh=ENDPOINT".
+    --print-config lists them. Flags win over variables, and variables over the file. When live
+    streams are served, it prints one line: "listening grpc=HOST:PORT http=HOST:PORT", and with
+    Zenoh also " zenoh=ENDPOINT". Lossless streams, pairs and sequences then wait for the larger
+    graphs that they need, which are loaded in the background.
     """
     flags: dict[str, Any] = {
         "grpc.port": grpc_port,
@@ -47,6 +48,10 @@ def serve(
         "model.weights": weights,
         "model.threads": threads,
     }
+    if not print_config:
+        typer.echo(
+            "vergence serve: starting", err=True
+        )  # the imports take seconds on slow machines
     try:
         from vergence_service.app.command import run_server
     except ModuleNotFoundError as error:

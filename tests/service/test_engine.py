@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from prometheus_client import CollectorRegistry
 
 from tests.support.frames import FRAME_NS, RIG, make_frame
 from tests.support.models import NOT_FINITE, RAISES, RecallModel
-from tests.support.server import ManualClock, running_server
+from tests.support.server import running_server
 from vergence_proto.errors import (
     BadPose,
     BadShape,
@@ -18,18 +17,12 @@ from vergence_proto.errors import (
     FrameOutOfOrder,
     ModelFailed,
     NonFinite,
-    NotReady,
     UnknownStream,
 )
 from vergence_proto.geometry import Axes, Pose
 from vergence_proto.types import Delivery, DisparityMap, Origin, PoseSample, StereoFrame, StereoRig
-from vergence_service.inference.batcher import StepBatcher
-from vergence_service.metrics import Metrics
-from vergence_service.streams.continuity import ContinuityLimits
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.stream import StreamConfig
-from vergence_service.streams.table import StreamTable
-from vergence_service.threads import Threads
 
 OPENING = StreamConfig(StereoRig.from_rectified(RIG))
 
@@ -275,42 +268,3 @@ async def test_who_waits_for_every_frame_gets_a_first_one_with_more_iterations(
         await server.engine.open("a", opening)
         answers = [await step(server.engine, "a", make_frame(i)) for i in (1, 2)]
     assert [answer.iterations for answer in answers] == [cold, 1]
-
-
-async def test_before_the_model_is_loaded_every_opening_is_refused() -> None:
-    model, metrics = RecallModel(), Metrics(CollectorRegistry())
-    clock = ManualClock()
-    streams = StreamTable(
-        capacity=1,
-        per_client=None,
-        max_state_bytes=1 << 20,
-        idle_timeout_s=60,
-        idle_notice_s=10,
-        detach_grace_s=10,
-        clock=clock,
-        metrics=metrics,
-    )
-    async with (
-        Threads(lanes=1) as threads,
-        StepBatcher(model, max_batch=1, clock=clock, metrics=metrics) as batcher,
-    ):
-        engine = DepthEngine(
-            streams,
-            batcher,
-            card=model.card,
-            iterations=1,
-            cold_iterations=dict.fromkeys(Delivery, 4),
-            limits=ContinuityLimits(max_gap_s=1, max_jump_m=1, max_jump_deg=45),
-            max_pixels=RIG.width * RIG.height,
-            clock=clock,
-            metrics=metrics,
-            threads=threads,
-        )
-        with pytest.raises(NotReady, match="loading") as refusal:
-            await engine.open("a", OPENING)
-        assert refusal.value.retry_after_s is not None
-        assert not engine.ready
-        await engine.start()
-        assert engine.ready
-        await engine.open("a", OPENING)
-        assert (await step(engine, "a", make_frame(1))).origin is Origin.COLD_START

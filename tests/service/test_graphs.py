@@ -6,20 +6,23 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from onnxruntime import InferenceSession
 from onnxruntime.capi.onnxruntime_pybind11_state import InvalidArgument
 
 from tests.support.frames import make_frame
 from tests.support.weights_copy import WEIGHTS, Entry, copied_weights
 from vergence_proto.geometry import RectifiedRig
 from vergence_proto.model_io import ManifestError
+from vergence_service.inference import graphs as graphs_module
 from vergence_service.inference.model import RecurrentState, Step, StepResult, StereoView
 from vergence_service.inference.onnx_model import OnnxStereoModel, on_host
-from vergence_service.inference.providers import DeviceTensor
+from vergence_service.inference.providers import DeviceTensor, start_session
 
 RIG = RectifiedRig(70, 40, 50.0, 50.0, 34.5, 34.5, 19.5, 0.1)
 WHITE = 255  # that the graphs fail on
@@ -195,6 +198,28 @@ def test_a_graph_that_several_counts_share_is_loaded_once(tmp_path: Path) -> Non
             (weights / shared).unlink()
         for one, other in zip(expected, walk(model), strict=True):
             assert_same(one, other)
+
+
+def test_a_step_whose_graphs_are_loaded_does_not_wait_for_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    entered, may_go_on = threading.Event(), threading.Event()
+
+    def start_slowly(*given: Any) -> InferenceSession:
+        entered.set()
+        assert may_go_on.wait(timeout=30)
+        return start_session(*given)
+
+    with opened("staged") as model, ThreadPoolExecutor() as threads:
+        model.warm_up(1, 1)
+        monkeypatch.setattr(graphs_module, "start_session", start_slowly)
+        loading = threads.submit(model.warm_up, 2, 2)
+        try:
+            assert entered.wait(timeout=30)
+            model.step([Step(make_view(1), None, 1)])
+            assert not loading.done()
+        finally:
+            may_go_on.set()
 
 
 def whiten(view: StereoView, *, left: bool, right: bool) -> StereoView:

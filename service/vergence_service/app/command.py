@@ -42,6 +42,7 @@ def run_server(flags: Mapping[str, Any], *, config: Path | None, print_config: b
             level=settings.log_level.upper(),
             format="%(asctime)s %(levelname)s %(name)s %(message)s",
         )
+        logging.getLogger("uvicorn.error").setLevel(logging.WARNING)  # says "started" too early
         keep_freed_memory()
         asyncio.run(serve(settings, on_serving=_announce))
     except _OPERATOR_ERRORS as error:

@@ -34,7 +34,7 @@ class HttpTransport:
     """The HTTP server while it runs."""
 
     server: HttpServer
-    start_jobs: Callable[[], None]  # call it when the model is loaded
+    start_jobs: Callable[[], None]  # call it when every graph is loaded
 
 
 @asynccontextmanager

@@ -1,11 +1,13 @@
 """Compose the server from its settings, run it, and drain it at the end."""
 
 import asyncio
+import logging
 import signal
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager, closing
 from dataclasses import dataclass
+from typing import Any
 
 from prometheus_client import CollectorRegistry
 
@@ -28,6 +30,8 @@ from vergence_service.transports.open_calls import OpenCalls
 from vergence_service.transports.stream_call import StreamLimits
 from vergence_service.transports.unary import UnaryMethods
 
+log = logging.getLogger(__name__)
+
 _MIB = 1 << 20
 _SWEEP_EVERY_S = 1.0
 
@@ -42,6 +46,7 @@ class Running:
     grpc: GrpcServer
     http: HttpServer
     zenoh: ZenohTransport | None
+    loading: asyncio.Task[None]  # of the graphs that live streams do not need
 
 
 def make_model(settings: Settings) -> OnnxStereoModel:
@@ -128,21 +133,22 @@ async def running(
         ) as grpc_server,
         serving_http(settings, http_host, engine, unary, open_calls(), registry) as http,
         serving_zenoh(settings, unary, open_calls()) as zenoh,
-        _sweeping(streams),
+        _in_background(_sweep(streams)),
     ):
         await engine.start()
-        http.start_jobs()
         await grpc_server.serving()
         if zenoh is not None:
             await zenoh.server.serving()
-        yield Running(
-            format_address(grpc_host, grpc_server.port),
-            format_address(http_host, http.server.port),
-            engine,
-            grpc_server,
-            http.server,
-            zenoh,
-        )
+        async with _in_background(_load_rest(engine, http.start_jobs)) as loading:
+            yield Running(
+                format_address(grpc_host, grpc_server.port),
+                format_address(http_host, http.server.port),
+                engine,
+                grpc_server,
+                http.server,
+                zenoh,
+                loading,
+            )
 
 
 async def serve(settings: Settings, *, on_serving: Callable[[Running], None]) -> None:
@@ -158,6 +164,8 @@ async def serve(settings: Settings, *, on_serving: Callable[[Running], None]) ->
     with closing(make_model(settings)) as model:
         async with running(settings, model) as server:
             on_serving(server)
+            # A graph that cannot be loaded ends the server; its error leaves `running`.
+            server.loading.add_done_callback(lambda task: stop.set() if _failed(task) else None)
             await stop.wait()
             await drain(server, within_s=settings.server.drain_s)
 
@@ -172,16 +180,30 @@ async def drain(server: Running, *, within_s: float) -> None:
             tasks.create_task(server.zenoh.server.drain(within_s=within_s))
 
 
-@asynccontextmanager
-async def _sweeping(streams: StreamTable) -> AsyncIterator[None]:
-    async def sweep() -> None:
-        while True:
-            await asyncio.sleep(_SWEEP_EVERY_S)
-            streams.sweep()
+async def _load_rest(engine: DepthEngine, start_jobs: Callable[[], None]) -> None:
+    await engine.load_rest()
+    start_jobs()
+    log.info("every graph is loaded")
 
-    task = asyncio.create_task(sweep(), name="sweep")
+
+async def _sweep(streams: StreamTable) -> None:
+    while True:
+        await asyncio.sleep(_SWEEP_EVERY_S)
+        streams.sweep()
+
+
+@asynccontextmanager
+async def _in_background(work: Coroutine[Any, Any, None]) -> AsyncIterator[asyncio.Task[None]]:
+    """Run ``work`` beside the block. The end of the block cancels it, or raises its error."""
+    task = asyncio.create_task(work)
     try:
-        yield
+        yield task
     finally:
         task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
+        await asyncio.wait([task])
+    if _failed(task):
+        task.result()
+
+
+def _failed(task: asyncio.Task[None]) -> bool:
+    return not task.cancelled() and task.exception() is not None

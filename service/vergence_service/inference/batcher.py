@@ -93,9 +93,8 @@ class StepBatcher:
             item.answer.set_exception(Draining("the server stopped before it took the frame"))
 
     async def warm_up(self, iterations: int, *cold_iterations: int) -> None:
-        """Load the model, in a thread that will run it."""
-        loop = asyncio.get_running_loop()
-        await loop.run_in_executor(self._threads, self._model.warm_up, iterations, *cold_iterations)
+        """Load the graphs of these steps. Steps whose graphs are loaded run meanwhile."""
+        await asyncio.to_thread(self._model.warm_up, iterations, *cold_iterations)
 
     async def step(
         self,

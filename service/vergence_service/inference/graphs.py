@@ -9,6 +9,7 @@ steps run in parallel instead, and each runs its graphs one after the other.
 import logging
 import os
 import threading
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
@@ -102,10 +103,14 @@ class GraphRunner:
         execution provider cannot start.
         """
         step = self._card.stages(iterations, cold_pixels=cold_pixels)
+        if (graphs := self._steps.get(step)) is not None:
+            return graphs  # without the lock: another thread may load a slow graph
         with self._loading:
             if step not in self._steps:
+                started_s = time.monotonic()
+                log.info("loading %s, %d iterations", self._card.name, iterations)
                 self._steps[step] = self._loaded(iterations, step)
-                log.info("loaded %s, %d iterations", self._card.name, iterations)
+                log.info("loaded it in %.1f s", time.monotonic() - started_s)
             return self._steps[step]
 
     def _loaded(self, iterations: int, step: Stages) -> list[list[_Graph]]:

@@ -1,6 +1,8 @@
 """The engine: open a stream, step it frame by frame, close it."""
 
+import asyncio
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from enum import Enum
 
 from vergence_proto.errors import (
@@ -30,6 +32,10 @@ from vergence_service.streams.rectify import Rectifier
 from vergence_service.streams.stream import Attachment, Notice, NoticeKind, Stream, StreamConfig
 from vergence_service.streams.table import StreamTable
 from vergence_service.threads import ThreadPool, Threads
+
+# A client that comes while the model loads waits for at most this long. It is below the time that
+# the SDK waits for a stream to open, 5 s.
+_LOADING_PATIENCE_S = 3.0
 
 
 class _Phase(Enum):
@@ -69,6 +75,7 @@ class DepthEngine:
         self._limits = limits
         self._clock = clock
         self._phase = _Phase.LOADING
+        self._started = asyncio.Event()
 
     @property
     def ready(self) -> bool:
@@ -76,14 +83,26 @@ class DepthEngine:
         return self._phase is _Phase.SERVING
 
     async def start(self) -> None:
-        """Load the model. Until this is done, opening a stream raises NotReady."""
-        counts = (self._iterations, *self._cold_iterations.values())
-        await self._batcher.warm_up(*map(self.card.iterations_at_most, counts))
+        """Load what live streams need, and accept streams.
+
+        Until then, opening a stream waits, and raises NotReady after a few seconds.
+        """
+        await self._load(Delivery.NEWEST)
         self._phase = _Phase.SERVING
+        self._started.set()
+
+    async def load_rest(self) -> None:
+        """Load what lossless streams and pairs need besides; they wait for it."""
+        await self._load(Delivery.EVERY)
+
+    async def _load(self, delivery: Delivery) -> None:
+        counts = (self._iterations, self._cold_iterations[delivery])
+        await self._batcher.warm_up(*map(self.card.iterations_at_most, counts))
 
     def drain(self, *, within_s: float) -> None:
         """Accept no new streams, and notify the clients that are attached."""
         self._phase = _Phase.DRAINING
+        self._started.set()
         notice = Notice(NoticeKind.DRAINING, "the server is shutting down", within_s)
         for attachment in self.streams.attachments():
             attachment.notify(notice)
@@ -236,6 +255,9 @@ class DepthEngine:
             )
 
     async def _rectifier(self, rig: StereoRig) -> Rectifier:
+        with suppress(TimeoutError):
+            async with asyncio.timeout(_LOADING_PATIENCE_S):
+                await self._started.wait()
         self._check_serving()
         width, height = rig.left.width, rig.left.height
         if width * height > self.max_pixels:
