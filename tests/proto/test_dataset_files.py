@@ -115,7 +115,7 @@ class TestPfm:
 
 
 class TestImages:
-    @pytest.mark.parametrize("name", ["a.png", "a.webp", "a.ppm", "a.bmp", "a.tiff"])
+    @pytest.mark.parametrize("name", ["a.png", "a.webp", "a.ppm"])
     def test_red_is_the_first_channel_in_every_format(self, name: str, tmp_path: Path) -> None:
         trees.write_image(tmp_path / name, trees.an_image(0))
         np.testing.assert_array_equal(read_image(tmp_path / name), trees.an_image(0))
@@ -126,7 +126,7 @@ class TestImages:
         expected = np.repeat(grey[..., None], 3, axis=2)
         np.testing.assert_array_equal(read_image(tmp_path / "a.png"), expected)
 
-    @pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.webp", "a.ppm", "a.bmp"])
+    @pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.webp", "a.ppm"])
     def test_half_an_image_is_an_error(self, name: str, tmp_path: Path) -> None:
         path = tmp_path / name
         trees.write_image(path, trees.an_image(0))

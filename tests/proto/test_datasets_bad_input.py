@@ -61,7 +61,11 @@ VERGENCE = [
     ("no left image", _without("frame_0000_left.png"), "frame_0000_left.png: not found"),
     ("a small right image", _image("frame_0001_right.png", 20, 16), "right.png: expected 24x16"),
     ("half an image", _cut("frame_0001_left.png"), "frame_0001_left.png: the PNG of"),
-    ("text as an image", _writing("frame_0001_left.png", "hm"), "frame_0001_left.png: 2 bytes"),
+    (
+        "text as an image",
+        _writing("frame_0001_left.png", "hm"),
+        "frame_0001_left.png: expected a PNG",
+    ),
     ("a short pose", _writing("poses.txt", "1 0 0"), "poses.txt, line 1: expected 12 numbers"),
     ("a pose of words", _writing("poses.txt", "north " * 12), "poses.txt, line 1: could not"),
     ("no rotation", _writing("poses.txt", "1 " * 12), "poses.txt, line 1: expected a rotation"),

@@ -170,7 +170,7 @@ HOSTILE = {
     "a kind of image that nobody needs": Hostile(
         lambda: zip_bytes({**FILES, "frame_0001_right.png": b"II*\0 and more"}.items()),
         "BAD_SEQUENCE",
-        says="TIFF",
+        says="frame_0001_right.png: expected PNG",
     ),
     "no baseline": Hostile(
         lambda: changed(calib=json.dumps({**CALIBRATION, "baseline_m": 0}).encode()),

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vergence_proto.codec.images import decode_image
+from vergence_proto.codec.images import decode_image, decode_stored
 from vergence_proto.datasets.files import DatasetError, existing
 from vergence_proto.errors import BadImage
 from vergence_proto.types import Image, Plane
@@ -63,7 +63,7 @@ def read_disparity_png(path: Path) -> Plane:
 
     Raises DatasetError: the file is missing, damaged, or no 16-bit grey PNG.
     """
-    stored = read_stored_png(path)
+    stored = read_stored(path)
     if stored.dtype != np.uint16 or stored.ndim != 2:
         raise DatasetError(
             f"{path}: expected a 16-bit grey PNG (disparity x256), "
@@ -74,17 +74,15 @@ def read_disparity_png(path: Path) -> Plane:
     return disparity_px.astype(np.float32)
 
 
-def read_stored_png(path: Path) -> NDArray[Any]:
-    """Read all channels of a PNG, with the numbers as they are stored.
+def read_stored(path: Path) -> NDArray[Any]:
+    """Read all channels of a PNG, PGM or PPM, with the numbers as they are stored.
 
     Raises DatasetError: the file is missing, damaged or cut short.
     """
-    data = existing(path, "a PNG").read_bytes()
     try:
-        decode_image(data)  # raises if the file is damaged
+        return decode_stored(existing(path, "an image").read_bytes())
     except BadImage as error:
         raise DatasetError(f"{path}: {error}") from None
-    return np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED))
 
 
 def write_pfm(path: Path, values: Plane) -> None:

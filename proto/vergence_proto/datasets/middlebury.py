@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from vergence_proto.datasets.files import DatasetError, numbers, read_lines
-from vergence_proto.datasets.images import read_pfm, read_stored_png
+from vergence_proto.datasets.images import read_pfm, read_stored
 from vergence_proto.datasets.listing import found, image_beside
 from vergence_proto.datasets.packings import offsets_of_either_sign
 from vergence_proto.datasets.source import FrameFiles, StereoSource, Truth, rectified_rig
@@ -85,7 +85,7 @@ def _truth(path: Path, mask_path: Path) -> Truth:
     offset_px = offsets_of_either_sign(read_pfm(path))
     if not mask_path.exists():
         return Truth(offset_px)
-    mask = read_stored_png(mask_path)
+    mask = read_stored(mask_path)
     if mask.ndim != 2:
         raise DatasetError(f"{mask_path}: expected a grey PNG, got {list(mask.shape)}")
     return Truth(offset_px, visible=np.asarray(mask == _VISIBLE))

@@ -3,12 +3,11 @@
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vergence_proto.datasets.files import DatasetError, existing
-from vergence_proto.datasets.images import read_image, read_stored_png
+from vergence_proto.datasets.images import read_image, read_stored
 from vergence_proto.datasets.source import Mask, rectified_rig
 from vergence_proto.types import Plane, StereoRig
 
@@ -49,14 +48,7 @@ def read_grey(path: Path) -> NDArray[Any]:
 
     Raises DatasetError: the file is missing, damaged or coloured.
     """
-    if path.suffix.lower() == ".png":
-        stored = read_stored_png(path)
-    else:
-        data = np.frombuffer(existing(path, "a grey image").read_bytes(), np.uint8)
-        decoded = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
-        if decoded is None:
-            raise DatasetError(f"{path}: expected a grey image, got {data.size} bytes of no image")
-        stored = np.asarray(decoded)
+    stored = read_stored(path)
     if stored.ndim == 3 and all(np.array_equal(stored[..., 0], stored[..., k]) for k in (1, 2)):
         stored = stored[..., 0]
     if stored.ndim != 2:

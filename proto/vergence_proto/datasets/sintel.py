@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from vergence_proto.datasets.files import DatasetError, existing
-from vergence_proto.datasets.images import read_stored_png
+from vergence_proto.datasets.images import read_stored
 from vergence_proto.datasets.listing import found, image_beside, images, number_in
 from vergence_proto.datasets.packings import nominal_rig, read_mask, size_of
 from vergence_proto.datasets.poses import checked_pose
@@ -111,7 +111,7 @@ def _read_camera(path: Path) -> tuple[Matrix, Pose]:
 
 def _truth(split: Path, name: Path) -> Truth:
     path = split / "disparities" / name
-    stored = read_stored_png(path)
+    stored = read_stored(path)
     if stored.dtype != np.uint8 or stored.ndim != 3 or stored.shape[2] != 3:
         raise DatasetError(
             f"{path}: expected disparity packed in RGB, 8 bits each, "

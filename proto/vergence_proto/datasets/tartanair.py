@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from vergence_proto.datasets.files import DatasetError, existing, numbers, read_lines
-from vergence_proto.datasets.images import read_stored_png
+from vergence_proto.datasets.images import read_stored
 from vergence_proto.datasets.listing import (
     found,
     image_beside,
@@ -122,7 +122,7 @@ def _read_depth(path: Path) -> Plane:
     existing(path, "depth in metres")
     if path.suffix != ".png":
         return read_npy(path, "depth").astype(np.float32)
-    stored = read_stored_png(path)
+    stored = read_stored(path)
     if stored.dtype != np.uint8 or stored.ndim != 3 or stored.shape[2] != 4:
         raise DatasetError(f"{path}: expected depth as an RGBA PNG, got {list(stored.shape)}")
     return np.ascontiguousarray(stored).view("<f4")[..., 0].astype(np.float32)

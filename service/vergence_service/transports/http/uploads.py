@@ -16,6 +16,7 @@ from fastapi import Request
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 from starlette.requests import ClientDisconnect
 
+from vergence_proto.codec.image_files import ImageKind, image_kind
 from vergence_proto.errors import BadSequence, UploadTooLarge
 from vergence_service.jobs.archives import ArchiveLimits, unpacking
 from vergence_service.threads import ThreadPool
@@ -33,7 +34,7 @@ ARCHIVE_TYPES = (
     "application/octet-stream",
 )
 _LARGEST_JSON = 32 << 20
-_EXTENSIONS = {b"\x89PNG": "png", b"\xff\xd8\xff": "jpg", b"RIFF": "webp"}
+_EXTENSIONS = {ImageKind.PNG: "png", ImageKind.JPEG: "jpg", ImageKind.WEBP: "webp"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -243,8 +244,8 @@ def _sequence_form(path: Path) -> SequenceForm:
 
 def _extension(image: Path) -> str:
     with image.open("rb") as file:
-        start = file.read(4)
-    for magic, extension in _EXTENSIONS.items():
-        if start.startswith(magic):
-            return extension
-    raise BadSequence(f"expected PNG, JPEG or WebP images, got a file starting {start!r}")
+        start = file.read(16)
+    kind = image_kind(start)
+    if kind not in _EXTENSIONS:
+        raise BadSequence(f"expected PNG, JPEG or WebP images, got a file starting {start[:4]!r}")
+    return _EXTENSIONS[kind]
