@@ -14,7 +14,9 @@ class ModelInfo:
     iterations: tuple[int, ...]
     """The iteration counts that a step can run."""
     max_disparity_px: int
-    """The largest disparity in pixels that the model searches."""
+    """The largest disparity that the model searches, in pixels of images up to 1280 px wide.
+
+    A result states its own range as ``max_disparity_px``."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,7 @@
 The codec and the data set readers make them and check them. Code below those does not check again.
 """
 
+import math
 import re
 from dataclasses import dataclass, field
 from enum import Enum
@@ -301,6 +302,8 @@ class DisparityMap:
     """Frames that were sent and not stepped since the previous result."""
     timings: Timings = field(default_factory=Timings)
     """The server's time for this frame."""
+    max_disparity_px: float = math.inf
+    """The range of the search in pixels: what is nearer than its depth has no value."""
 
     @property
     def depth_m(self) -> Plane:

@@ -89,6 +89,12 @@ class ModelSettings(_Section):
     cold_iterations_every: PositiveInt = Field(
         default=8, description="most iterations of the cold step of a lossless stream or a pair"
     )
+    min_range_share: float = Field(
+        default=0.15,
+        ge=0,
+        le=1,
+        description="reduce larger images until the search reaches this share of their width",
+    )
     max_batch: PositiveInt = Field(
         default=1, description="streams that a GPU steps together; a CPU steps each by itself"
     )

@@ -56,6 +56,7 @@ def a_map(pose: Pose | None = None) -> DisparityMap:
         iterations=2,
         frames_skipped=1,
         timings=Timings(0.001, 0.002, 0.003, 0.004, 0.01),
+        max_disparity_px=96.5,
     )
 
 
@@ -129,6 +130,7 @@ class TestDisparity:
         assert (back.frame_id, back.capture_ns, back.rig) == (7, -5, RIG)
         assert (back.origin, back.step_count, back.iterations) == (Origin.RESUMED, 3, 2)
         assert (back.frames_skipped, back.timings) == (1, sent.timings)
+        assert back.max_disparity_px == 96.5
         half_a_step = 1 / 128
         assert back.sigma_px is not None
         assert sent.sigma_px is not None

@@ -43,6 +43,7 @@ from vergence_proto.errors import ErrorCode
 from vergence_proto.types import Plane
 from vergence_service.inference.model import Step, StepResult
 from vergence_service.transports.http.errors import HTTP_STATUS
+from vergence_service.transports.http.pairs import RANGE_HEADER
 
 FRAMES = make_frames(6)
 ARCHIVE = zip_bytes(sequence_files(FRAMES))
@@ -268,12 +269,19 @@ async def test_a_pair_is_answered_at_once() -> None:
         query: dict[str, str | float] = {"format": "npy", "output": "depth"}
         query |= {"fx_px": RIG.fx, "baseline_m": RIG.baseline_m}
         depth = await client.post("/v1/pairs", params=query, files=files)
+        sure = await client.post("/v1/pairs", params={"output": "confidence"}, files=files)
     expected = codec.disparity_from_proto(streamed, RIG)
     np.testing.assert_array_equal(np.load(io.BytesIO(exact.content)), expected.disparity_px)
     np.testing.assert_array_equal(np.load(io.BytesIO(depth.content)), expected.depth_m)
     assert rounded.headers["Content-Type"] == "image/png"
     stored = cv2.imdecode(np.frombuffer(rounded.content, np.uint8), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(stored, np.rint(expected.disparity_px * 256))
+    assert float(rounded.headers[RANGE_HEADER]) == expected.max_disparity_px == 64
+    confidence = cv2.imdecode(np.frombuffer(sure.content, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert confidence is not None
+    assert confidence.dtype == np.uint8
+    assert confidence.shape == (RIG.height, RIG.width)
+    assert confidence.any()
 
 
 async def test_health_metrics_and_schema_answer() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tests.support.frames import RIG, make_frame
+from tests.support.frames import REACH, RIG, make_frame
 from tests.support.models import RecallModel
 from tests.support.server import running_server
 from vergence_proto.errors import BadCalibration
@@ -79,7 +79,7 @@ def centre(image: NDArray[np.uint8]) -> Points:
 @pytest.mark.parametrize("name", list(RIGS))
 def test_a_point_lands_where_the_rectified_rig_says(name: str) -> None:
     rig = RIGS[name]
-    rectifier = Rectifier.of(rig)
+    rectifier = Rectifier.of(rig, REACH)
     stated = rectifier.rig
     point_left = np.array([0.15, -0.1, 1.4])
     point_right = rig.left_from_right.inverse().apply(point_left)
@@ -101,7 +101,7 @@ def test_a_point_lands_where_the_rectified_rig_says(name: str) -> None:
 
 async def test_replies_state_the_rectified_rig_its_pose_and_nothing_unseen() -> None:
     rig = RIGS["pinhole"]
-    rectifier = Rectifier.of(rig)
+    rectifier = Rectifier.of(rig, REACH)
     world_from_left = Pose.from_xyzw(np.array([0.1, 0.2, 0.0, 1.0]), np.array([1.0, 2.0, 3.0]))
     image = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
     frame = StereoFrame(1, 1, image, image, PoseSample(world_from_left))
@@ -118,7 +118,7 @@ async def test_replies_state_the_rectified_rig_its_pose_and_nothing_unseen() -> 
 
 
 def test_a_rig_that_is_rectified_is_left_as_it_is() -> None:
-    rectifier = Rectifier.of(StereoRig.from_rectified(RIG))
+    rectifier = Rectifier.of(StereoRig.from_rectified(RIG), REACH)
     frame = make_frame(1)
     left, right = rectifier.rectify(frame.left, frame.right)
     assert rectifier.rig == RIG
@@ -141,4 +141,4 @@ def one_fisheye(rig: StereoRig) -> StereoRig:
 @pytest.mark.parametrize("spoil", [turned_around, one_above_the_other, one_fisheye])
 def test_a_rig_that_cannot_be_rectified_is_refused(spoil: Callable[[StereoRig], StereoRig]) -> None:
     with pytest.raises(BadCalibration, match="expected"):
-        Rectifier.of(spoil(RIGS["pinhole"]))
+        Rectifier.of(spoil(RIGS["pinhole"]), REACH)

@@ -134,6 +134,7 @@ async def not_started() -> AsyncIterator[DepthEngine]:
             cold_iterations=dict.fromkeys(Delivery, 4),
             limits=ContinuityLimits(max_gap_s=1, max_jump_m=1, max_jump_deg=45),
             max_pixels=RIG.width * RIG.height,
+            min_range_share=0.0,
             clock=clock,
             metrics=metrics,
             threads=threads,

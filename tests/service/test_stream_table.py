@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, invariant, rule
 from prometheus_client import CollectorRegistry
 
-from tests.support.frames import RIG
+from tests.support.frames import REACH, RIG
 from tests.support.server import ManualClock
 from vergence_proto.errors import (
     DepthError,
@@ -27,7 +27,7 @@ from vergence_service.streams.table import StreamTable
 CAPACITY, PER_CLIENT, MEMORY, STATE = 3, 2, 1000, 400
 IDLE_S, NOTICE_S, GRACE_S, TOMBSTONE_S = 60.0, 10.0, 10.0, 300.0
 RIG_OPENING = StreamConfig(StereoRig.from_rectified(RIG))
-RECTIFIER = Rectifier.of(RIG_OPENING.rig)
+RECTIFIER = Rectifier.of(RIG_OPENING.rig, REACH)
 
 
 class Connection:

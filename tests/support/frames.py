@@ -6,10 +6,12 @@ from vergence_proto import codec
 from vergence_proto.geometry import Pose, RectifiedRig
 from vergence_proto.types import ImageEncoding, PoseSample, StereoFrame, StereoRig
 from vergence_proto.v1 import depth_pb2 as pb
+from vergence_service.streams.search_window import SearchReach
 
 RIG = RectifiedRig(
     width=64, height=48, fx=60.0, fy=60.0, cx_left=31.5, cx_right=31.5, cy=23.5, baseline_m=0.1
 )
+REACH = SearchReach(max_disparity_px=64, min_width_share=0.0)
 FRAME_NS = 33_000_000  # between two frames
 
 

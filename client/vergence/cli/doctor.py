@@ -110,7 +110,10 @@ def _weights() -> Finding:
         card = load_model_card(directory, _DEFAULT_MODEL)
     except ManifestError as error:
         return Finding(Verdict.BAD, "weights", str(error))
-    summary = f"{card.name} {card.weights_sha256[:12]}, matches its manifest"
+    summary = (
+        f"{card.name} {card.weights_sha256[:12]}, matches its manifest; "
+        f"searches {card.max_disparity_px} px"
+    )
     return Finding(Verdict.GOOD, "weights", summary)
 
 
@@ -125,5 +128,6 @@ async def _reachable(server: str) -> Finding:
     place = f"{info.provider} of {info.engine}" if info.engine else info.provider
     if info.instruction_set:
         place += f" ({info.instruction_set})"
-    about = f"{server} runs {info.version}, model {model} on {place}, {streams}"
+    reach = f"searches {info.model.max_disparity_px} px"
+    about = f"{server} runs {info.version}, model {model} on {place}, {reach}, {streams}"
     return Finding(Verdict.GOOD, "server", about)

@@ -127,6 +127,8 @@ def disparity_to_proto(
     message.step_count, message.iterations = disparity.step_count, disparity.iterations
     message.frames_skipped = disparity.frames_skipped
     message.timings.CopyFrom(timings_to_proto(disparity.timings))
+    if math.isfinite(disparity.max_disparity_px):
+        message.max_disparity_px = disparity.max_disparity_px
     if output.confidence and disparity.confidence is not None:
         bytes_plane_to_proto(
             disparity.confidence, compressed=output.compressed, into=message.confidence
@@ -170,6 +172,7 @@ def disparity_from_proto(message: pb.DisparityMap, rig: RectifiedRig) -> Dispari
         iterations=message.iterations,
         frames_skipped=message.frames_skipped,
         timings=timings_from_proto(message.timings),
+        max_disparity_px=message.max_disparity_px or math.inf,  # 0: an older server
     )
 
 

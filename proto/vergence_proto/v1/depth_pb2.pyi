@@ -252,7 +252,7 @@ class FramesDropped(_message.Message):
     def __init__(self, frame_ids: _Optional[_Iterable[int]] = ...) -> None: ...
 
 class DisparityMap(_message.Message):
-    __slots__ = ("frame_id", "capture_ns", "disparity", "confidence", "sigma", "world_from_left", "origin", "step_count", "iterations", "frames_skipped", "timings")
+    __slots__ = ("frame_id", "capture_ns", "disparity", "confidence", "sigma", "world_from_left", "origin", "step_count", "iterations", "frames_skipped", "timings", "max_disparity_px")
     FRAME_ID_FIELD_NUMBER: _ClassVar[int]
     CAPTURE_NS_FIELD_NUMBER: _ClassVar[int]
     DISPARITY_FIELD_NUMBER: _ClassVar[int]
@@ -264,6 +264,7 @@ class DisparityMap(_message.Message):
     ITERATIONS_FIELD_NUMBER: _ClassVar[int]
     FRAMES_SKIPPED_FIELD_NUMBER: _ClassVar[int]
     TIMINGS_FIELD_NUMBER: _ClassVar[int]
+    MAX_DISPARITY_PX_FIELD_NUMBER: _ClassVar[int]
     frame_id: int
     capture_ns: int
     disparity: Plane
@@ -275,7 +276,8 @@ class DisparityMap(_message.Message):
     iterations: int
     frames_skipped: int
     timings: Timings
-    def __init__(self, frame_id: _Optional[int] = ..., capture_ns: _Optional[int] = ..., disparity: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., confidence: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., sigma: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., world_from_left: _Optional[_Union[Pose, _Mapping[str, _Any]]] = ..., origin: _Optional[_Union[Origin, str]] = ..., step_count: _Optional[int] = ..., iterations: _Optional[int] = ..., frames_skipped: _Optional[int] = ..., timings: _Optional[_Union[Timings, _Mapping[str, _Any]]] = ...) -> None: ...
+    max_disparity_px: float
+    def __init__(self, frame_id: _Optional[int] = ..., capture_ns: _Optional[int] = ..., disparity: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., confidence: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., sigma: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., world_from_left: _Optional[_Union[Pose, _Mapping[str, _Any]]] = ..., origin: _Optional[_Union[Origin, str]] = ..., step_count: _Optional[int] = ..., iterations: _Optional[int] = ..., frames_skipped: _Optional[int] = ..., timings: _Optional[_Union[Timings, _Mapping[str, _Any]]] = ..., max_disparity_px: _Optional[float] = ...) -> None: ...
 
 class Timings(_message.Message):
     __slots__ = ("decode_us", "queue_us", "model_us", "encode_us", "total_us")

@@ -99,6 +99,7 @@ async def running(
         },
         limits=ContinuityLimits(**settings.continuity.model_dump()),
         max_pixels=settings.limits.max_pixels,
+        min_range_share=settings.model.min_range_share,
         clock=clock,
         metrics=metrics,
         threads=threads,

@@ -3,11 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vergence_proto.accuracy import confidence_from_sigma
 from vergence_proto.errors import BadShape
 from vergence_proto.geometry import Axes, Pose
-from vergence_proto.types import DisparityMap, Origin, Plane, StereoFrame, Timings
+from vergence_proto.types import DisparityMap, Origin, StereoFrame, Timings
 from vergence_service.inference.model import StepResult, StereoView
 from vergence_service.streams.rectify import Rectifier
 from vergence_service.streams.stream import Stream
@@ -31,7 +32,9 @@ def view_from_frame(frame: StereoFrame, rectifier: Rectifier, axes: Axes) -> Ste
         world_from_left = axes.to_opencv(frame.pose.world_from_left)
         world_from_rectified = world_from_left @ rectifier.left_from_rectified
     position_known = frame.pose is not None and frame.pose.position_valid
-    return StereoView(left, right, rig, frame.capture_ns, world_from_rectified, position_known)
+    return StereoView(
+        left, right, rectifier.window.rig, frame.capture_ns, world_from_rectified, position_known
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,28 +54,25 @@ class SteppedFrame:
     def disparity_map(self) -> DisparityMap:
         """Make the answer. This works on whole images: call it in a worker thread."""
         result, config = self.result, self.stream.config
-        pose = self.view.world_from_left
+        pose, rectifier = self.view.world_from_left, self.stream.rectifier
+        sigma_px = rectifier.sigma_px(result.sigma_px)
+        disparity_px = rectifier.disparity_px(result.offset_px)
+        confidence: NDArray[np.uint8] | None = None
+        if config.output.confidence:
+            confidence = confidence_from_sigma(sigma_px)
+            confidence[np.isnan(disparity_px)] = 0
         return DisparityMap(
             frame_id=self.frame_id,
             capture_ns=self.view.capture_ns,
-            rig=self.view.rig,
-            disparity_px=_disparity_px(result.offset_px, self.stream.rectifier),
-            sigma_px=result.sigma_px if config.output.sigma else None,
-            confidence=confidence_from_sigma(result.sigma_px) if config.output.confidence else None,
+            rig=rectifier.rig,
+            disparity_px=disparity_px,
+            sigma_px=sigma_px if config.output.sigma else None,
+            confidence=confidence,
             world_from_left=None if pose is None else config.axes.from_opencv(pose),
             origin=self.origin,
             step_count=result.state.step_count,
             iterations=self.iterations,
             frames_skipped=self.frames_skipped,
             timings=self.timings,
+            max_disparity_px=rectifier.window.max_disparity_px,
         )
-
-
-def _disparity_px(offset_px: Plane, rectifier: Rectifier) -> Plane:
-    """Convert pixel offset to disparity: NaN if it is not positive or the camera saw nothing."""
-    disparity_px = offset_px - np.float32(rectifier.rig.offset_of_zero_disparity_px)
-    valid = disparity_px > 0
-    if rectifier.seen is not None:
-        valid &= rectifier.seen
-    disparity_px[~valid] = np.nan
-    return disparity_px

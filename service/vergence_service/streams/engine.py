@@ -29,6 +29,7 @@ from vergence_service.metrics import Metrics
 from vergence_service.streams.continuity import ContinuityLimits
 from vergence_service.streams.conversion import SteppedFrame, view_from_frame
 from vergence_service.streams.rectify import Rectifier
+from vergence_service.streams.search_window import SearchReach
 from vergence_service.streams.stream import Attachment, Notice, NoticeKind, Stream, StreamConfig
 from vergence_service.streams.table import StreamTable
 from vergence_service.threads import ThreadPool, Threads
@@ -60,6 +61,7 @@ class DepthEngine:
         cold_iterations: Mapping[Delivery, int],
         limits: ContinuityLimits,
         max_pixels: int,
+        min_range_share: float,
         clock: Callable[[], float],
         metrics: Metrics,
         threads: Threads,
@@ -73,6 +75,7 @@ class DepthEngine:
         self._iterations = iterations
         self._cold_iterations = cold_iterations
         self._limits = limits
+        self._reach = SearchReach(card.max_disparity_px, min_range_share)
         self._clock = clock
         self._phase = _Phase.LOADING
         self._started = asyncio.Event()
@@ -123,7 +126,8 @@ class DepthEngine:
         """
         self._check_model(config)
         rectifier = await self._rectifier(config.rig)
-        reserve = state_bytes(self.card, rectifier.rig.height, rectifier.rig.width)
+        searched = rectifier.window.rig
+        reserve = state_bytes(self.card, searched.height, searched.width)
         return self.streams.open(
             stream_id,
             config,
@@ -264,7 +268,7 @@ class DepthEngine:
             raise FrameTooLarge(
                 f"expected at most {self.max_pixels} pixels per image, got {width}x{height}"
             )
-        return await self.threads.background.run(Rectifier.of, rig)
+        return await self.threads.background.run(Rectifier.of, rig, self._reach)
 
     async def _step(
         self,

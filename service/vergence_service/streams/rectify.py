@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from vergence_proto.errors import BadCalibration
 from vergence_proto.geometry import Matrix, Pose, RectifiedRig
-from vergence_proto.types import Distortion, Image, Intrinsics, StereoRig
+from vergence_proto.types import Distortion, Image, Intrinsics, Plane, StereoRig
+from vergence_service.streams.search_window import SearchReach, SearchWindow
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,25 +27,28 @@ class _Maps:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rectifier:
-    """Rectifies the images of one rig."""
+    """Makes the model's images from those of one rig."""
 
-    rig: RectifiedRig
+    rig: RectifiedRig  # of the rectified images, in which results are given
+    window: SearchWindow
     left_from_rectified: Pose  # a rotation: both left cameras have one centre
     maps: tuple[_Maps, _Maps] | None = None  # None: the rig is already rectified
     seen: NDArray[np.bool_] | None = None  # [H, W]: the left camera saw this rectified pixel
 
     @classmethod
-    def of(cls, rig: StereoRig) -> Self:
-        """Make a rectifier, with maps if the rig needs them.
+    def of(cls, rig: StereoRig, reach: SearchReach) -> Self:
+        """Make a rectifier, with maps if the rig needs them, for a model of that reach.
 
         Raises BadCalibration if the right camera is not on the right, or if the cameras have no
         view in common.
         """
         rectified = rig.as_rectified()
-        return cls(rectified, Pose.identity()) if rectified else cls._from_cameras(rig)
+        if rectified is None:
+            return cls._from_cameras(rig, reach)
+        return cls(rectified, SearchWindow.of(rectified, reach), Pose.identity())
 
     @classmethod
-    def _from_cameras(cls, rig: StereoRig) -> Self:
+    def _from_cameras(cls, rig: StereoRig, reach: SearchReach) -> Self:
         fisheye = {
             camera.distortion is Distortion.KANNALA_BRANDT for camera in (rig.left, rig.right)
         }
@@ -84,13 +88,29 @@ class Rectifier:
         if not seen.any():
             raise BadCalibration("no pixel of the rectified left image is seen by the camera")
         left_from_rectified = Pose(rotations[0].T.copy(), np.zeros(3))
-        return cls(rectified, left_from_rectified, (left_maps, right_maps), seen)
+        window = SearchWindow.of(rectified, reach)
+        return cls(rectified, window, left_from_rectified, (left_maps, right_maps), seen)
 
     def rectify(self, left: Image, right: Image) -> tuple[Image, Image]:
-        if self.maps is None:
-            return left, right
-        left_maps, right_maps = self.maps
-        return left_maps.remap(left), right_maps.remap(right)
+        """The pair as the model sees it, from images as the cameras took them."""
+        if self.maps is not None:
+            left_maps, right_maps = self.maps
+            left, right = left_maps.remap(left), right_maps.remap(right)
+        return self.window.images(left, right)
+
+    def disparity_px(self, offset_px: Plane) -> Plane:
+        """Disparity [H, W] of ``rig`` from the model's offset.
+
+        It is NaN where it is not positive or beyond the range, or where the camera saw nothing.
+        """
+        disparity_px = self.window.disparity_px(offset_px, self.rig.height, self.rig.width)
+        if self.seen is not None:
+            disparity_px[~self.seen] = np.nan
+        return disparity_px
+
+    def sigma_px(self, sigma_px: Plane) -> Plane:
+        """Sigma [H, W] of ``rig`` from the model's."""
+        return self.window.sigma_px(sigma_px, self.rig.height, self.rig.width)
 
 
 def _pinhole(rig: StereoRig) -> tuple[list[Matrix], list[Matrix]]:

@@ -6,14 +6,23 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
+import cv2
 import numpy as np
 from fastapi import APIRouter, Query, Request, Response
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from vergence_proto.datasets import DatasetError, encode_disparity_png, read_image
 from vergence_proto.errors import BadCalibration, BadImage, BadShape, FrameTooLarge
 from vergence_proto.geometry import RectifiedRig
-from vergence_proto.types import Delivery, Image, Plane, StereoFrame, StereoRig
+from vergence_proto.types import (
+    Delivery,
+    DisparityMap,
+    Image,
+    OutputFormat,
+    StereoFrame,
+    StereoRig,
+)
 from vergence_service.jobs.upload_checks import check_file
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.stream import StreamConfig
@@ -39,6 +48,7 @@ class PairOutput(StrEnum):
 
     DISPARITY = "disparity"
     DEPTH = "depth"
+    CONFIDENCE = "confidence"
 
 
 class PairQuery(BaseModel):
@@ -49,13 +59,15 @@ class PairQuery(BaseModel):
     format: PairFormat = PairFormat.PNG16
     output: PairOutput = Field(
         default=PairOutput.DISPARITY,
-        description="depth is in metres and needs fx_px and baseline_m",
+        description="depth is in metres and needs fx_px and baseline_m; confidence is the "
+        "probability of an error below 1 px, times 255, 0 where there is no value",
     )
     iterations: int = Field(default=0, ge=0, le=64, description="0: as many as a cold start")
     fx_px: float | None = Field(default=None, ge=1, le=1e6)
     baseline_m: float | None = Field(default=None, ge=1e-4, le=1e3)
 
 
+RANGE_HEADER = "Vergence-Max-Disparity-Px"
 _FILE = {"type": "string", "format": "binary"}
 _BODY: dict[str, Any] = {
     "requestBody": {
@@ -74,7 +86,14 @@ _BODY: dict[str, Any] = {
 }
 _ANSWER: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "16-bit PNG (value times 256, 0: no value) or float32 NPY (NaN: no value)",
+        "description": "16-bit PNG (value times 256, 0: no value) or float32 NPY (NaN: no value); "
+        "confidence: 8-bit PNG or uint8 NPY",
+        "headers": {
+            RANGE_HEADER: {
+                "description": "range of the search in pixels; nearer surfaces have no value",
+                "schema": {"type": "number"},
+            }
+        },
         "content": {"image/png": {"schema": _FILE}, "application/octet-stream": {"schema": _FILE}},
     }
 }
@@ -111,13 +130,13 @@ def pair_routes(engine: DepthEngine, *, limits: UploadLimits) -> APIRouter:
         config = StreamConfig(
             StereoRig.from_rectified(rig),
             delivery=Delivery.EVERY,
+            output=OutputFormat(confidence=query.output is PairOutput.CONFIDENCE),
             cold_iterations=query.iterations,
         )
         stream = await engine.open_offline(config)
         frame = StereoFrame(1, 0, left, right)
         disparity, _ = await engine.step_offline(stream, lambda: frame)
-        wanted = disparity.depth_m if query.output is PairOutput.DEPTH else disparity.disparity_px
-        return await background.run(_encoded, wanted, query.format)
+        return await background.run(_answer, disparity, query)
 
     return router
 
@@ -154,9 +173,33 @@ def _image(path: Path, name: str, max_pixels: int) -> Image:
         raise BadImage(f"{name} image: {str(error).removeprefix(f'{path}: ')}") from None
 
 
-def _encoded(values: Plane, form: PairFormat) -> Response:
-    if form is PairFormat.PNG16:
-        return Response(encode_disparity_png(values), media_type="image/png")
+def _answer(disparity: DisparityMap, query: PairQuery) -> Response:
+    plain = query.format is PairFormat.PNG16
+    match query.output:
+        case PairOutput.CONFIDENCE:
+            assert disparity.confidence is not None  # the stream was opened with it
+            confidence = disparity.confidence
+            response = _png(_encoded_png(confidence)) if plain else _npy(confidence)
+        case PairOutput.DEPTH:
+            depth_m = disparity.depth_m
+            response = _png(encode_disparity_png(depth_m)) if plain else _npy(depth_m)
+        case PairOutput.DISPARITY:
+            disparity_px = disparity.disparity_px
+            response = _png(encode_disparity_png(disparity_px)) if plain else _npy(disparity_px)
+    response.headers[RANGE_HEADER] = f"{disparity.max_disparity_px:g}"
+    return response
+
+
+def _encoded_png(levels: NDArray[np.uint8]) -> bytes:
+    _, png = cv2.imencode(".png", levels)
+    return png.tobytes()
+
+
+def _png(content: bytes) -> Response:
+    return Response(content, media_type="image/png")
+
+
+def _npy(values: NDArray[np.generic]) -> Response:
     file = io.BytesIO()
     np.save(file, values, allow_pickle=False)
     return Response(file.getvalue(), media_type="application/octet-stream")

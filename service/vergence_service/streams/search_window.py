@@ -1,0 +1,101 @@
+"""How a rectified pair is shown to the model, whose search covers a fixed range of offsets."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Self
+
+import cv2
+import numpy as np
+
+from vergence_proto.geometry import RectifiedRig
+from vergence_proto.types import Image, Plane
+
+
+@dataclass(frozen=True, slots=True)
+class SearchReach:
+    """The range of disparities that streams are searched for."""
+
+    max_disparity_px: int  # the model searches offsets from 0 to this
+    min_width_share: float  # the least range of a large image, as a share of its width; 0: none
+
+
+@dataclass(frozen=True, slots=True)
+class SearchWindow:
+    """The images of one rig as the model sees them, and its answer in the rig's own pixels.
+
+    The model searches from offset 0. So the right image is moved by whole pixels to make that
+    disparity 0: cameras whose principal points differ lose no range. And where its range would be
+    a small share of a wide image, the image is reduced by a whole factor.
+    """
+
+    rig: RectifiedRig  # of the images that the model sees
+    right_shift_px: int
+    reduction: int
+    max_disparity_px: float  # in the rig's own pixels
+
+    @classmethod
+    def of(cls, rig: RectifiedRig, reach: SearchReach) -> Self:
+        shift = math.floor(rig.offset_of_zero_disparity_px)
+        share = reach.min_width_share * rig.width / reach.max_disparity_px
+        reduction = max(1, math.ceil(share))
+        shifted = replace(rig, cx_right=rig.cx_right + shift)
+        beyond_zero_px = shifted.offset_of_zero_disparity_px
+        return cls(
+            _reduced(shifted, reduction),
+            shift,
+            reduction,
+            reach.max_disparity_px * reduction - beyond_zero_px,
+        )
+
+    def images(self, left: Image, right: Image) -> tuple[Image, Image]:
+        """The images as the model sees them, from uint8 [H, W, C] of the rig's size."""
+        if self.right_shift_px:
+            width = right.shape[1]
+            columns = np.arange(width) - self.right_shift_px
+            right = right[:, columns.clip(0, width - 1)]  # the image's edge repeats
+        return self._smaller(left), self._smaller(right)
+
+    def disparity_px(self, offset_px: Plane, height: int, width: int) -> Plane:
+        """Disparity [H, W] of the rig from the model's offset; NaN where it is out of range."""
+        disparity_px = self._enlarged(
+            offset_px - np.float32(self.rig.offset_of_zero_disparity_px), height, width
+        )
+        disparity_px[(disparity_px <= 0) | (disparity_px > self.max_disparity_px)] = np.nan
+        return disparity_px
+
+    def sigma_px(self, sigma_px: Plane, height: int, width: int) -> Plane:
+        """Sigma [H, W] in the rig's pixels."""
+        return self._enlarged(sigma_px, height, width)
+
+    def _smaller(self, image: Image) -> Image:
+        if self.reduction == 1:
+            return image
+        around = ((0, -image.shape[0] % self.reduction), (0, -image.shape[1] % self.reduction))
+        whole = np.pad(image, (*around, (0, 0)), mode="edge")
+        size = (self.rig.width, self.rig.height)
+        return np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+    def _enlarged(self, plane: Plane, height: int, width: int) -> Plane:
+        if self.reduction == 1:
+            return plane
+        size = (self.rig.width * self.reduction, self.rig.height * self.reduction)
+        larger = cv2.resize(plane, size, interpolation=cv2.INTER_LINEAR)
+        return np.asarray(larger[:height, :width] * np.float32(self.reduction), np.float32)
+
+
+def _reduced(rig: RectifiedRig, factor: int) -> RectifiedRig:
+    """The rig of images whose pixels are blocks of ``factor`` x ``factor``."""
+
+    def centre(c: float) -> float:
+        return (c + 0.5) / factor - 0.5
+
+    return RectifiedRig(
+        width=-(-rig.width // factor),
+        height=-(-rig.height // factor),
+        fx=rig.fx / factor,
+        fy=rig.fy / factor,
+        cx_left=centre(rig.cx_left),
+        cx_right=centre(rig.cx_right),
+        cy=centre(rig.cy),
+        baseline_m=rig.baseline_m,
+    )
