@@ -149,7 +149,8 @@ class ContinuitySettings(_Section):
 class BatchSettings(_Section):
     directory: Path | None = Field(
         default=None,
-        description="folder of jobs and results; default: $XDG_STATE_HOME/vergence/batch",
+        description="folder of jobs and results; default: $XDG_STATE_HOME/vergence/batch, or "
+        "batch-PORT if another server uses that",
     )
     waiting: PositiveInt = Field(
         default=64, description="most unfinished sequences, the running one included"

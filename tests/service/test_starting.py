@@ -23,6 +23,7 @@ from tests.support.weights_copy import Entry, copied_weights
 from vergence_proto.errors import NotReady
 from vergence_proto.types import Delivery, StereoRig
 from vergence_service.inference.batcher import StepBatcher
+from vergence_service.jobs.store import JobStore, StoreInUse
 from vergence_service.metrics import Metrics
 from vergence_service.streams import engine as engine_module
 from vergence_service.streams.continuity import ContinuityLimits
@@ -30,6 +31,7 @@ from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.stream import StreamConfig
 from vergence_service.streams.table import StreamTable
 from vergence_service.threads import Threads
+from vergence_service.transports.errors import PortTaken
 
 OPENING = StreamConfig(StereoRig.from_rectified(RIG))
 HEALTH_NAMES = ["", "vergence.v1.DepthService"]
@@ -185,3 +187,36 @@ def test_a_slow_graph_that_cannot_be_loaded_ends_the_server_in_one_line(tmp_path
     assert done.returncode == 2
     assert "staged, 2 iterations: expected" in done.stderr.splitlines()[-1]
     assert "Traceback" not in done.stderr
+
+
+def jobs_folders(state: Path) -> set[str]:
+    return {path.parent.name for path in (state / "vergence").glob("*/jobs.sqlite3")}
+
+
+async def test_a_second_server_keeps_its_sequences_in_a_folder_of_its_own(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    port = free_port()
+    own = f"batch-{port}"
+    async with running_server(RecallModel(), batch__directory=None) as first:
+        taken = int(first.http_address.rpartition(":")[2])
+        with pytest.raises(PortTaken):
+            await running_server(
+                RecallModel(), batch__directory=None, http__port=taken
+            ).__aenter__()
+        assert jobs_folders(tmp_path) == {"batch"}
+        async with (
+            running_server(RecallModel(), batch__directory=None, http__port=port) as second,
+            running_server(RecallModel(), batch__directory=None) as third,
+        ):
+            assert jobs_folders(tmp_path) == {"batch", own}
+            for server in (second, third):
+                url = f"http://{server.http_address}/v1/sequences"
+                assert (await asyncio.to_thread(httpx.get, url)).status_code == 200
+    # At its next start it finds its jobs again, even if the first folder is free now.
+    async with running_server(RecallModel(), batch__directory=None, http__port=port):
+        with JobStore(tmp_path / "vergence" / "batch"):
+            pass
+        with pytest.raises(StoreInUse, match="another server uses this folder"):
+            JobStore(tmp_path / "vergence" / own).__enter__()

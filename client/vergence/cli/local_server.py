@@ -13,11 +13,15 @@ from typing import IO, Literal
 from rich.console import Console
 
 from vergence.cli.errors import CliError
+from vergence.client import DepthClient
+from vergence.transports.addresses import DEFAULT_SERVER
+from vergence_proto.errors import DepthError
 from vergence_proto.extras import how_to_install
 
 _READY = re.compile(r"listening grpc=(\S+) http=(\S+)")
 _START_TIMEOUT_S = 60.0  # loading and warming a model up takes seconds on a small machine
 _STOP_TIMEOUT_S = 15.0
+_LOOK_S = 1.0
 
 
 @asynccontextmanager
@@ -57,12 +61,25 @@ async def server_for(server: str | None, console: Console) -> AsyncIterator[str]
     if server is not None:
         yield server
         return
+    if await _answers(DEFAULT_SERVER):
+        place = DEFAULT_SERVER.partition("://")[2]
+        console.print(f"[dim]a server answers at {place}; to use it, add --server {place}[/]")
     with console.status("starting a server") as status:
         async with local_server() as address:
             status.stop()
             yield address
             status.update("stopping the server")
             status.start()
+
+
+async def _answers(server: str) -> bool:
+    """Check for a server that is started already: two share the cores, and both get slow."""
+    try:
+        async with asyncio.timeout(_LOOK_S), DepthClient(server) as client:
+            await client.server_info()
+    except (DepthError, TimeoutError):
+        return False
+    return True
 
 
 async def _addresses(process: asyncio.subprocess.Process, log: IO[str]) -> dict[str, str]:

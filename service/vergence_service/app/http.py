@@ -3,19 +3,21 @@
 import asyncio
 import logging
 import os
-from collections.abc import AsyncIterator, Callable
-from contextlib import AsyncExitStack, asynccontextmanager
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, contextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from prometheus_client import CollectorRegistry
 
 from vergence_service.jobs.archives import ArchiveLimits
 from vergence_service.jobs.queue import JobQueue, QueueLimits
-from vergence_service.jobs.store import JobStore, StoreUnavailable
+from vergence_service.jobs.store import JobStore, StoreInUse, StoreUnavailable
 from vergence_service.settings import Settings
 from vergence_service.streams.engine import DepthEngine
+from vergence_service.transports.addresses import listening_socket
 from vergence_service.transports.http.app import HttpServer, make_http_app
 from vergence_service.transports.http.pairs import pair_routes
 from vergence_service.transports.http.sequences import no_sequence_routes, sequence_routes
@@ -66,10 +68,14 @@ async def serving_http(
     )
     stopping = asyncio.Event()
     async with AsyncExitStack() as stack:
+        # First of all: a server that cannot listen must not take a folder of jobs.
+        listening = stack.enter_context(
+            listening_socket(host, settings.http.port, transport="http")
+        )
         routes = [pair_routes(engine, limits=pair), stream_routes(calls, unary)]
         start: Callable[[], None]
         try:
-            store = stack.enter_context(JobStore(batch.directory or _default_jobs_directory()))
+            store = stack.enter_context(_job_store(settings))
         except StoreUnavailable as error:
             # Without a disk the server can still serve live streams.
             log.warning("this server accepts no sequences: %s", error)
@@ -100,7 +106,7 @@ async def serving_http(
             routes=routes,
         )
         server = await stack.enter_async_context(
-            HttpServer(app, calls, host=host, port=settings.http.port, stopping=stopping)
+            HttpServer(app, calls, listening=listening, stopping=stopping)
         )
         yield HttpTransport(server, start)
 
@@ -109,6 +115,27 @@ def _nothing() -> None:
     """Start no jobs, because there is no queue."""
 
 
-def _default_jobs_directory() -> Path:
+@contextmanager
+def _job_store(settings: Settings) -> Iterator[JobStore]:
+    """Open the folder of the settings, or a default one that no other server uses.
+
+    The first server takes ``batch``. Another one takes ``batch-PORT``, now and at its next start;
+    without a port of its own it takes a folder that ends with it. Raises StoreUnavailable.
+    """
     state = os.environ.get("XDG_STATE_HOME")
-    return (Path(state) if state else Path.home() / ".local" / "state") / "vergence" / "batch"
+    base = (Path(state) if state else Path.home() / ".local" / "state") / "vergence"
+    shared, own = base / "batch", base / f"batch-{settings.http.port}"
+    with ExitStack() as stack:
+        if settings.batch.directory is not None:
+            store = stack.enter_context(JobStore(settings.batch.directory))
+        elif settings.http.port and own.exists():
+            store = stack.enter_context(JobStore(own))
+        else:
+            try:
+                store = stack.enter_context(JobStore(shared))
+            except StoreInUse:
+                if not settings.http.port:
+                    own = Path(stack.enter_context(TemporaryDirectory(prefix="vergence-batch-")))
+                log.info("another server keeps its sequences in %s, this one in %s", shared, own)
+                store = stack.enter_context(JobStore(own))
+        yield store

@@ -23,7 +23,11 @@ from vergence_service.jobs.job import Job, job_from_json, job_to_json
 
 
 class StoreUnavailable(OSError):
-    """The folder of the jobs cannot be written, or another server uses it."""
+    """The folder of the jobs cannot be used."""
+
+
+class StoreInUse(StoreUnavailable):
+    """Another server uses the folder of the jobs."""
 
 
 # Columns for queries and for people. The JSON document contains the whole job.
@@ -40,8 +44,8 @@ CREATE TABLE IF NOT EXISTS jobs (
 class JobStore:
     """The jobs of one server on disk. All methods block; any thread may call them.
 
-    Entering the context raises StoreUnavailable if the folder cannot be written, or if another
-    server uses it.
+    Entering the context raises StoreInUse if another server uses the folder, and StoreUnavailable
+    if it cannot be written.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -71,10 +75,12 @@ class JobStore:
             self._clear_leftovers()
         except sqlite3.Error as error:
             self._database.close()
-            raise StoreUnavailable(
-                f"cannot keep jobs in {self._directory}: {error}; if another server uses this "
-                "folder, choose another one with batch.directory"
-            ) from None
+            if error.sqlite_errorcode == sqlite3.SQLITE_BUSY:
+                raise StoreInUse(
+                    f"cannot keep jobs in {self._directory}: another server uses this folder; "
+                    "choose another one with batch.directory"
+                ) from None
+            raise StoreUnavailable(f"cannot keep jobs in {self._directory}: {error}") from None
         return self
 
     def __exit__(self, *exc_info: object) -> None:

@@ -1,16 +1,25 @@
 """Errors that keep a transport from starting, each one sentence for the operator."""
 
+import errno
+
 from vergence_proto.extras import Extra, how_to_install
 
 
 class PortTaken(OSError):
-    """The server cannot listen on an address."""
+    """The server cannot listen on an address. ``transport`` is ``grpc`` or ``http``."""
 
-    def __init__(self, address: str, setting: str) -> None:
-        super().__init__(
-            f"cannot listen on {address}: another server uses the port, or the address does not "
-            f"belong to this machine; choose another with {setting}"
-        )
+    def __init__(self, address: str, transport: str, error: OSError) -> None:
+        if error.errno == errno.EADDRINUSE:
+            why = (
+                "another server uses this port; use that server, or give this one free ports with "
+                "--grpc-port 0 --http-port 0"
+            )
+        else:
+            why = (
+                f"{error.strerror or error}; choose another address with --host, or another port "
+                f"with --{transport}-port"
+            )
+        super().__init__(f"cannot listen on {address} ({transport}.port): {why}")
 
 
 class ExtraMissing(ImportError):

@@ -12,7 +12,7 @@ from grpc_reflection.v1alpha import reflection
 from vergence_proto.errors import BadShape
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.v1 import depth_pb2_grpc
-from vergence_service.transports.addresses import format_address
+from vergence_service.transports.addresses import format_address, listening_socket
 from vergence_service.transports.errors import PortTaken
 from vergence_service.transports.grpc.errors import Context, errors_as_status
 from vergence_service.transports.open_calls import OpenCalls
@@ -99,7 +99,7 @@ class GrpcServer:
         self, servicer: DepthServicer, *, host: str, port: int, max_frame_bytes: int
     ) -> None:
         self._servicer = servicer
-        self._address = format_address(host, port)
+        self._host = host
         self._max_message_bytes = int(max_frame_bytes * _ROOM_OVER_THE_LIMIT)
         self._health = health.aio.HealthServicer()  # type: ignore[attr-defined] # bound at import
         self.port = port
@@ -120,10 +120,13 @@ class GrpcServer:
             [_SERVICE, health.SERVICE_NAME, reflection.SERVICE_NAME], self._server
         )
         await self._set_health(health_pb2.HealthCheckResponse.NOT_SERVING)
+        # gRPC's own error does not say why, and it writes a second one to stderr.
+        listening_socket(self._host, self.port, transport="grpc").close()
+        address = format_address(self._host, self.port)
         try:
-            self.port = self._server.add_insecure_port(self._address)
-        except RuntimeError:
-            raise PortTaken(self._address, "grpc.port") from None
+            self.port = self._server.add_insecure_port(address)
+        except RuntimeError as error:
+            raise PortTaken(address, "grpc", OSError(str(error))) from None
         await self._server.start()
         return self
 

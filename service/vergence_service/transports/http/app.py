@@ -12,7 +12,6 @@ from fastapi.openapi.utils import get_openapi
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
 from pydantic.json_schema import models_json_schema
 
-from vergence_service.transports.errors import PortTaken
 from vergence_service.transports.http.errors import Problem, install_problems
 from vergence_service.transports.http.uploads import SequenceForm
 from vergence_service.transports.open_calls import OpenCalls
@@ -96,25 +95,18 @@ class HttpServer:
     """Serves the app as long as its context lasts.
 
     At the end, it sets ``stopping``, ends ``calls``, and waits for the answers that are being sent.
-    Entering the context raises PortTaken if the server cannot listen on the address.
     """
 
     def __init__(
-        self, app: FastAPI, calls: OpenCalls, *, host: str, port: int, stopping: asyncio.Event
+        self, app: FastAPI, calls: OpenCalls, *, listening: socket.socket, stopping: asyncio.Event
     ) -> None:
         self._app = app
         self._calls = calls
-        self._address = (host, port)
+        self._socket = listening
         self._stopping = stopping
-        self.port = port
+        self.port: int = listening.getsockname()[1]
 
     async def __aenter__(self) -> Self:
-        family = socket.AF_INET6 if ":" in self._address[0] else socket.AF_INET
-        try:
-            self._socket = socket.create_server(self._address, family=family)
-        except OSError:
-            raise PortTaken("{}:{}".format(*self._address), "http.port") from None
-        self.port = self._socket.getsockname()[1]
         config = uvicorn.Config(
             self._app,
             log_config=None,
@@ -131,7 +123,6 @@ class HttpServer:
         await self._calls.drain(within_s=0)
         self._server.should_exit = True
         await self._task
-        self._socket.close()
 
     async def drain(self, *, within_s: float) -> None:
         """Wait until all calls end; after ``within_s``, answer what they have sent and end them."""
