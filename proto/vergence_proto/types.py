@@ -7,6 +7,7 @@ import math
 import re
 from dataclasses import dataclass, field
 from enum import Enum
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,6 +128,23 @@ class StereoRig:
             )
 
     @classmethod
+    def load(
+        cls,
+        path: Path | str,
+        right: Path | str | None = None,
+        *,
+        size: tuple[int, int] | None = None,
+        unit_m: float = 1.0,
+    ) -> "StereoRig":
+        """Read a rig from the file of a calibration tool; the format is recognised.
+
+        See :func:`vergence_proto.calibration.load_calibration` for formats, parameters and errors.
+        """
+        from vergence_proto.calibration import load_calibration  # it makes rigs
+
+        return load_calibration(path, right, size=size, unit_m=unit_m).rig
+
+    @classmethod
     def from_rectified(cls, rig: RectifiedRig) -> "StereoRig":
         """Make the general form of a rectified rig."""
         left = Intrinsics(rig.width, rig.height, rig.fx, rig.fy, rig.cx_left, rig.cy)
@@ -136,7 +154,7 @@ class StereoRig:
     def as_rectified(self) -> RectifiedRig | None:
         """Return the same rig as a rectified one if its rows already correspond, else None."""
         left, right = self.left, self.right
-        if left.distortion is not Distortion.NONE or right.distortion is not Distortion.NONE:
+        if _bends(left) or _bends(right):
             return None
         baseline_m, *off_axis = self.left_from_right.translation_m
         differences = np.array(
@@ -153,6 +171,13 @@ class StereoRig:
         return RectifiedRig(
             left.width, left.height, left.fx, left.fy, left.cx, right.cx, left.cy, float(baseline_m)
         )
+
+
+def _bends(camera: Intrinsics) -> bool:
+    """Return whether a lens distorts: a Brown-Conrady one of zeros is a pinhole camera."""
+    if camera.distortion is Distortion.BROWN_CONRADY:
+        return any(camera.coefficients)
+    return camera.distortion is not Distortion.NONE
 
 
 @dataclass(frozen=True, slots=True, eq=False)

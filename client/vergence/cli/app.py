@@ -188,6 +188,31 @@ def _batch(
     )
 
 
+@app.command("calib")
+def _calib(
+    file: Annotated[Path, typer.Argument(help="The file, the left camera's, or a folder.")],
+    right: Annotated[
+        Path | None, typer.Argument(help="The right camera's file, or OpenCV's extrinsics.")
+    ] = None,
+    size: Annotated[
+        str | None, typer.Option(help="WIDTHxHEIGHT, if the file does not state it.")
+    ] = None,
+    unit_m: Annotated[
+        float, typer.Option(min=0, help="Metres in a unit of length of OpenCV's file.")
+    ] = 1.0,
+    out: Annotated[
+        Path | None, typer.Option(help="Write the rig to this file, in our own format.")
+    ] = None,
+) -> None:
+    """Read a stereo calibration of any known tool, and show the rig.
+
+    Kalibr, Basalt, Monado, OpenCV, a pair of ROS CameraInfo, a pair of EuRoC's sensor.yaml.
+    """
+    from vergence.cli.calib import calib
+
+    calib(file, right, size=size, unit_m=unit_m, out=out, console=_console())
+
+
 @app.command("doctor")
 def _doctor(
     server: Annotated[
