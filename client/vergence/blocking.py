@@ -4,6 +4,7 @@ An event loop runs in one background thread, which the client's ``with`` starts 
 """
 
 import asyncio
+import os
 import threading
 from collections.abc import Callable, Coroutine
 from typing import Any, Self, TypeVar
@@ -18,6 +19,7 @@ from vergence.reprojection import DepthView, Fill, View
 from vergence.results import DepthResult, Drops, SessionEvent
 from vergence.session import DepthSession, WorldFromLeft
 from vergence.transports.addresses import DEFAULT_SERVER
+from vergence.transports.forks import FORKED
 from vergence_proto.geometry import Axes, Matrix, Pose, RectifiedRig
 from vergence_proto.types import Delivery, ImageEncoding, OutputFormat, PoseSample, StereoRig
 
@@ -78,6 +80,7 @@ class _LoopThread:
 
     def __init__(self) -> None:
         self._loop: asyncio.AbstractEventLoop | None = None
+        self._process = os.getpid()
 
     def start(self) -> None:
         started = threading.Event()
@@ -100,6 +103,9 @@ class _LoopThread:
             self._thread.join()
 
     def wait(self, work: Coroutine[Any, Any, Value]) -> Value:
+        if self._process != os.getpid():  # the thread stayed behind in the other process
+            work.close()
+            raise NotOpen(FORKED)
         if self._loop is None:
             work.close()
             raise NotOpen("the client is not open; write: with BlockingClient(server) as client")

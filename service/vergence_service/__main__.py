@@ -29,6 +29,9 @@ def serve(
     threads: Annotated[
         int | None, typer.Option(help="Threads of all steps; 0 uses one per core.")
     ] = None,
+    until_eof: Annotated[
+        bool, typer.Option("--until-eof", help="Stop when the standard input ends.")
+    ] = False,
 ) -> None:
     """Serve depth over gRPC, HTTP and, with --zenoh, Zenoh.
 
@@ -58,7 +61,7 @@ def serve(
         hint = f"needs {error.name}, which is not installed; install it: {how_to_install('server')}"
         typer.echo(f"vergence serve {hint}", err=True)
         raise typer.Exit(1) from None
-    run_server(flags, config=config, print_config=print_config)
+    run_server(flags, config=config, print_config=print_config, until_eof=until_eof)
 
 
 if __name__ == "__main__":

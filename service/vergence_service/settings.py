@@ -3,6 +3,7 @@
 import difflib
 import json
 import os
+import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -12,8 +13,17 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, V
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict
 from pydantic_settings.sources import InitSettingsSource
 
+from vergence_proto.datasets.files import decoded_text
+
 ENV_PREFIX = "VERGENCE_"
 _NESTED = "__"
+# Kubernetes and Docker describe a service or container named vergence or vergence-... in variables
+# of every pod and container beside it, as VERGENCE_PORT=tcp://10.0.0.1:50051. No setting has such a
+# name and value; VERGENCE_GRPC_PORT=1 is a misspelt setting.
+_SERVICE_LINK = re.compile(
+    ENV_PREFIX
+    + r"(\w+_)?(SERVICE_HOST=|SERVICE_PORT(_\w+)?=|PORT=\w+://|PORT_\d+_\w+=|NAME=/|ENV_\w+=)"
+)
 
 
 class SettingsError(ValueError):
@@ -235,8 +245,8 @@ def load_settings(
     _check_known(
         (
             name.removeprefix(ENV_PREFIX).lower().replace(_NESTED, ".")
-            for name in os.environ
-            if name.startswith(ENV_PREFIX)
+            for name, value in os.environ.items()
+            if name.startswith(ENV_PREFIX) and not _SERVICE_LINK.match(f"{name}={value}")
         ),
         f"in the environment ({ENV_PREFIX}...)",
     )
@@ -265,9 +275,13 @@ def load_settings(
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text("utf-8"))
+        text = decoded_text(path.read_bytes())
     except OSError as error:
         raise SettingsError(f"cannot read {path}: {error.strerror}") from None
+    if text is None:
+        raise SettingsError(f"cannot read {path}: it is not text")
+    try:
+        return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise SettingsError(f"{path} is not TOML: {error}") from None
 

@@ -1,8 +1,12 @@
 """The blocking facade, from plain threads against a server in another process."""
 
 import inspect
+import multiprocessing
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -110,3 +114,60 @@ def test_the_facade_lacks_nothing(blocking: type, asynchronous: type) -> None:
         return {name for name, _ in inspect.getmembers(kind) if not name.startswith("_")}
 
     assert public(asynchronous) - {"stream_id"} <= public(blocking)
+
+
+# In a process of its own: the servers of other tests live in this one.
+FORKS = """
+import multiprocessing, sys
+import vergence
+from tests.support.frames import RIG, make_frame
+
+server, frame = sys.argv[1], make_frame(1)
+
+def in_child(work):
+    context = multiprocessing.get_context("fork")
+    receiver, sender = context.Pipe(duplex=False)
+
+    def child():
+        try:
+            sender.send(str(work()))
+        except Exception as error:
+            sender.send(f"{type(error).__name__}: {error}")
+
+    process = context.Process(target=child)
+    process.start()
+    sender.close()
+    print(receiver.recv() if receiver.poll(20) else "hangs")
+    process.kill()
+    process.join()
+
+def depth():
+    return vergence.depth(frame.left, frame.right, RIG, server=server).frame_id
+
+in_child(depth)
+depth()
+in_child(depth)
+with vergence.BlockingClient(server) as client, client.open_session(RIG) as session:
+    in_child(depth)
+    in_child(lambda: session.submit(frame.left, frame.right))
+    session.submit(frame.left, frame.right)
+    print(next(iter(session)).frame_id)
+in_child(depth)
+"""
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="needs fork")
+def test_a_process_forked_while_a_session_is_open_is_told_so(server: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", FORKS, server],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        cwd=Path(__file__).parents[2],
+        check=True,
+    )
+    before, after, new, old, parent, at_last = done.stdout.splitlines()
+    assert (before, after, parent, at_last) == ("1", "1", "1", "1")
+    assert new.startswith("ConnectionLost: this process was forked")
+    assert old.startswith("NotOpen: this process was forked")
+    assert "'spawn'" in new

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import grpc
@@ -19,8 +20,10 @@ from tests.support.frames import frame_message, make_frame, open_message
 from tests.support.models import RecallModel
 from tests.support.server import RawCall, connected, raw_stream, running_server
 from tests.support.status import reason_of
+from tests.support.weights_copy import WEIGHTS
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_service.app.server import drain
+from vergence_service.app.server import Running, drain, serve
+from vergence_service.settings import load_settings
 from vergence_service.transports.errors import PortTaken
 
 SERVING = health_pb2.HealthCheckResponse.SERVING
@@ -117,6 +120,7 @@ def served(*arguments: str) -> Iterator[subprocess.Popen[str]]:
     """A server process with the packaged weights."""
     process = subprocess.Popen(
         [sys.executable, "-m", "vergence_service", *arguments],
+        stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -128,11 +132,14 @@ def served(*arguments: str) -> Iterator[subprocess.Popen[str]]:
         process.communicate()
 
 
+SMALL = ("--grpc-port", "0", "--http-port", "0", "--threads", "1")
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=lambda number: number.name)
 def test_the_process_tells_its_addresses_and_ends_cleanly_on_a_signal(
     number: signal.Signals,
 ) -> None:
-    with served("--grpc-port", "0", "--http-port", "0", "--threads", "1") as process:
+    with served(*SMALL) as process:
         assert process.stdout is not None
         word, *addresses = process.stdout.readline().split()
         assert word == "listening"
@@ -142,6 +149,42 @@ def test_the_process_tells_its_addresses_and_ends_cleanly_on_a_signal(
         assert ready.json() == {"status": "ready"}
         os.kill(process.pid, number)
         assert process.wait(timeout=20) == 0
+
+
+def test_the_end_of_its_input_ends_a_server_that_a_program_started() -> None:
+    with served(*SMALL, "--until-eof") as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("listening")
+        process.communicate(timeout=20)  # closes its input
+        assert process.returncode == 0
+
+
+async def test_a_server_starts_and_ends_where_no_event_loop_handles_signals(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every event loop of Windows raises NotImplementedError."""
+
+    def refuse(*_: object) -> None:
+        raise NotImplementedError
+
+    monkeypatch.setattr(asyncio.get_running_loop(), "add_signal_handler", refuse)
+    before = {number: signal.getsignal(number) for number in (1, signal.SIGINT, signal.SIGTERM)}
+    model = {"model.weights": WEIGHTS, "model.name": "whole", "model.threads": 1}
+    settings = load_settings(
+        flags={"grpc.port": 0, "http.port": 0, "batch.directory": tmp_path, **model}
+    )
+    served_at: list[str] = []
+
+    def on_serving(server: Running) -> None:
+        served_at.append(server.grpc_address)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    try:
+        await asyncio.wait_for(serve(settings, on_serving=on_serving), 20)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    assert served_at
 
 
 @pytest.mark.parametrize(

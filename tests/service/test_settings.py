@@ -88,6 +88,51 @@ def test_an_unknown_variable_is_named_with_the_nearest_known(
         load_settings()
 
 
+SERVICE_LINKS = {
+    "VERGENCE_PORT": "tcp://10.0.0.1:50051",
+    "VERGENCE_SERVICE_HOST": "10.0.0.1",
+    "VERGENCE_SERVICE_PORT": "50051",
+    "VERGENCE_SERVICE_PORT_GRPC": "50051",
+    "VERGENCE_PORT_50051_TCP": "tcp://10.0.0.1:50051",
+    "VERGENCE_PORT_50051_TCP_ADDR": "10.0.0.1",
+    "VERGENCE_PORT_53_UDP_PROTO": "udp",
+    # Of services named vergence-grpc and vergence-model, whose names are also those of sections.
+    "VERGENCE_GRPC_PORT": "tcp://10.0.0.2:50051",
+    "VERGENCE_MODEL_SERVICE_HOST": "10.0.0.3",
+    # Of a linked container.
+    "VERGENCE_NAME": "/robot/vergence",
+    "VERGENCE_ENV_PATH": "/usr/bin",
+    "VERGENCE_ENV_VERGENCE_GRPC__PORT": "7",
+}
+
+
+def test_what_an_orchestrator_tells_of_its_services_is_no_setting(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    before = load_settings().model_dump()
+    for name, value in SERVICE_LINKS.items():
+        monkeypatch.setenv(name, value)
+    assert load_settings().model_dump() == before
+
+
+@pytest.mark.parametrize(
+    "name", ["VERGENCE_GRPC_PORT", "VERGENCE_PORT", "VERGENCE_MODEL_NAME", "VERGENCE_LOGLEVEL"]
+)
+def test_a_setting_with_too_few_underscores_is_told(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(name, "50052")
+    with pytest.raises(SettingsError, match="unknown setting"):
+        load_settings()
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_a_file_may_start_with_a_byte_order_mark(encoding: str, tmp_path: Path) -> None:
+    config = tmp_path / "vergence.toml"
+    config.write_text("[grpc]\r\nport = 7\r\n", encoding)
+    assert load_settings(config=config).grpc.port == 7
+
+
 @pytest.mark.parametrize(
     ("flags", "says"),
     [

@@ -34,9 +34,9 @@ JsonOption = Annotated[
 
 
 def _await(work: Coroutine[Any, Any, Value]) -> Value:
-    import asyncio
+    from vergence.cli.ending import run_until_stopped
 
-    return asyncio.run(work)
+    return run_until_stopped(work)
 
 
 def _console() -> "Console":

@@ -20,6 +20,7 @@ from vergence.cli.local_server import local_server
 from vergence.cli.progress import progress_bar
 from vergence.cli.sequence_jobs import Job, Query, SequenceService
 from vergence.cli.uploads import Upload, find_uploads
+from vergence.transports.http import http_client
 from vergence_proto.errors import DepthError
 from vergence_proto.jobs import JobState
 
@@ -79,7 +80,7 @@ async def _send(
     # Only connecting is bounded: the length of an upload is not known.
     timeout = httpx.Timeout(None, connect=_CONNECT_S)
     with progress_bar(console) as progress, tempfile.TemporaryDirectory() as scratch:
-        async with httpx.AsyncClient(base_url=address, timeout=timeout) as http:
+        async with http_client(address, timeout=timeout) as http:
             service = SequenceService(http)
             places = asyncio.Semaphore(_AT_ONCE)
 

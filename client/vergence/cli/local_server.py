@@ -43,9 +43,13 @@ async def local_server(
     ):
         process = await asyncio.create_subprocess_exec(
             *(sys.executable, "-m", "vergence_service"),
-            *("--grpc-port", "0", "--http-port", "0"),
+            # Whatever the environment sets, only this command reaches this server, and the server
+            # ends with it: even one that is killed closes its end of the pipe.
+            *("--grpc-port", "0", "--http-port", "0", "--host", "127.0.0.1", "--no-zenoh"),
+            "--until-eof",
             *arguments,
             env={**os.environ, "VERGENCE_BATCH__DIRECTORY": jobs},
+            stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
             stderr=log,
         )
@@ -103,8 +107,11 @@ def _last_words(what: str, log: IO[str]) -> str:
 
 async def _stop(process: asyncio.subprocess.Process) -> None:
     """Ask the server to drain, and kill it if it does not end."""
-    with suppress(ProcessLookupError):
-        process.terminate()
+    assert process.stdin is not None
+    process.stdin.close()  # the end of its input; on Windows, terminate() would kill it
+    if sys.platform != "win32":
+        with suppress(ProcessLookupError):
+            process.terminate()
     try:
         await asyncio.wait_for(process.wait(), _STOP_TIMEOUT_S)
     except TimeoutError:

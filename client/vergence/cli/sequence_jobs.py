@@ -12,6 +12,7 @@ from typing import Any, Self
 import httpx
 
 from vergence.cli.errors import CliError
+from vergence.transports.proxies import through_proxy
 from vergence_proto.errors import DepthError, error_from_wire
 from vergence_proto.jobs import JobState
 
@@ -126,7 +127,8 @@ class SequenceService:
                 return await ask()
             except httpx.TransportError as error:
                 if time.monotonic() - since_s > _PATIENCE_S:
-                    raise CliError(f"cannot reach {self.http.base_url}: {error}") from None
+                    through = through_proxy(str(self.http.base_url)) if self.http.trust_env else ""
+                    raise CliError(f"cannot reach {self.http.base_url}{through}: {error}") from None
             await asyncio.sleep(_ASK_EVERY_S)
 
 

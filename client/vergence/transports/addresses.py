@@ -31,7 +31,7 @@ def connector(server: str) -> "Callable[[], Transport]":
     if scheme == ("grpc" if separator else "") and _is_place(address):
         from vergence.transports.grpc import GrpcTransport
 
-        return partial(GrpcTransport, address)
+        return partial(GrpcTransport, address, direct=on_this_machine(server))
     if scheme in ("http", "https") and _is_place(address):
         return _http_connector(server)
     kind, _, link = scheme.partition("+")
@@ -41,18 +41,20 @@ def connector(server: str) -> "Callable[[], Transport]":
 
 
 def on_this_machine(server: str) -> bool:
-    """Return True if ``server`` is a loopback address, so that bytes cost no network.
+    """Return True if ``server`` is a loopback address: it costs no network and needs no proxy.
 
     A Zenoh address is that of a router; the server may be elsewhere.
     """
     scheme, _, address = server.rpartition("://")
-    host = urlsplit(f"//{address}").hostname or ""
+    host = (urlsplit(f"//{address}").hostname or "").removesuffix(".")
     if scheme not in ("", "grpc", "http", "https"):
         return False
     try:
-        return ipaddress.ip_address(host).is_loopback
+        ip = ipaddress.ip_address(host)
     except ValueError:
-        return host == "localhost"
+        return host == "localhost" or host.endswith(".localhost")  # RFC 6761
+    ip = getattr(ip, "ipv4_mapped", None) or ip
+    return ip.is_loopback or ip.is_unspecified
 
 
 def _zenoh_connector(server: str, link: str) -> "Callable[[], Transport]":

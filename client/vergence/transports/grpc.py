@@ -8,7 +8,9 @@ import grpc
 from google.protobuf.message import Message
 from grpc_status import rpc_status
 
+from vergence.transports import forks
 from vergence.transports.base import Answer, Call, ConnectionLost
+from vergence.transports.proxies import through_proxy
 from vergence_proto import codec
 from vergence_proto.errors import DepthError, FrameTooLarge, NotReady
 from vergence_proto.v1 import depth_pb2 as pb
@@ -38,23 +40,32 @@ _CHANNEL_OPTIONS = (
 
 
 class GrpcTransport:
-    """The :class:`~vergence.transports.base.Transport` to one ``host:port``, in the clear."""
+    """The :class:`~vergence.transports.base.Transport` to one ``host:port``, in the clear.
 
-    def __init__(self, address: str) -> None:
+    ``direct``: without the web proxy that the environment may name.
+    Raises ConnectionLost: the process was forked while another client was open.
+    """
+
+    def __init__(self, address: str, *, direct: bool = False) -> None:
+        forks.check_not_forked()
         self._address = address
-        self._channel = grpc.aio.insecure_channel(address, options=_CHANNEL_OPTIONS)
+        options = (*_CHANNEL_OPTIONS, ("grpc.enable_http_proxy", int(not direct)))
+        self._channel: grpc.aio.Channel | None
+        self._channel = grpc.aio.insecure_channel(address, options=options)
+        forks.watch(self._channel)
+        self._through = "" if direct else through_proxy(f"grpc://{address}")
 
     async def open_call(self, stream_id: str) -> Call:
-        start = self._channel.stream_stream(
+        start = self._open_channel().stream_stream(
             f"{_SERVICE}StreamDepth",
             request_serializer=bytes,  # requests are serialized already
             response_deserializer=pb.StreamDepthResponse.FromString,
         )
         call = start(request_iterator=None, metadata=((STREAM_ID_METADATA, stream_id),))
-        return _GrpcCall(call, self._address)
+        return _GrpcCall(call, self._address, self._through)
 
     async def ask(self, method: str, request: Message, answer: type[Answer]) -> Answer:
-        invoke = self._channel.unary_unary(
+        invoke = self._open_channel().unary_unary(
             f"{_SERVICE}{method}",
             request_serializer=type(request).SerializeToString,
             response_deserializer=answer.FromString,
@@ -62,11 +73,18 @@ class GrpcTransport:
         try:
             response: Answer = await invoke(request, timeout=_ASK_TIMEOUT_S)
         except grpc.aio.AioRpcError as error:
-            raise _error_from_rpc(error, self._address) from None
+            raise _error_from_rpc(error, self._address, self._through) from None
         return response
 
     async def close(self) -> None:
-        await self._channel.close(grace=None)
+        channel, self._channel = self._channel, None  # a session may keep this transport for long
+        if channel is not None:
+            await channel.close(grace=None)
+
+    def _open_channel(self) -> grpc.aio.Channel:
+        if self._channel is None:
+            raise ConnectionLost(f"the connection to {self._address} was closed")
+        return self._channel
 
 
 class _GrpcCall:
@@ -74,10 +92,13 @@ class _GrpcCall:
         self,
         call: "grpc.aio.StreamStreamCall[bytes, pb.StreamDepthResponse]",
         address: str,
+        through: str,
     ) -> None:
+        forks.watch(call)
         self._call = call
         self._responses = aiter(call)
         self._address = address
+        self._through = through
         self._status: asyncio.Future[grpc.aio.AioRpcError]
         self._status = asyncio.get_running_loop().create_future()
         call.add_done_callback(self._keep_status)
@@ -93,7 +114,8 @@ class _GrpcCall:
             # status comes behind them.
             return await anext(self._responses, None)
         except grpc.aio.AioRpcError as error:
-            raise _error_from_rpc(await self._why_ended(error), self._address) from None
+            why = await self._why_ended(error)
+            raise _error_from_rpc(why, self._address, self._through) from None
         except asyncio.CancelledError:
             # gRPC raises it also if the channel was closed and nobody cancelled this task.
             task = asyncio.current_task()
@@ -140,7 +162,7 @@ def _status_of(
     raise AssertionError("the status of a call that has ended is known")
 
 
-def _error_from_rpc(error: grpc.aio.AioRpcError, address: str) -> DepthError:
+def _error_from_rpc(error: grpc.aio.AioRpcError, address: str, through: str) -> DepthError:
     """Return the error that the server raised, by its ErrorInfo, else a connection error."""
     status = rpc_status.from_call(cast(grpc.Call, error))  # it has every method that is used
     ours = codec.error_from_status(status) if status is not None else None
@@ -153,4 +175,4 @@ def _error_from_rpc(error: grpc.aio.AioRpcError, address: str) -> DepthError:
         return NotReady(f"{address} speaks gRPC but does not offer vergence.v1: {details}")
     # Only the end of gRPC's sentence is informative.
     reason = (details or code.name).rpartition("last error: ")[2].removeprefix("UNKNOWN: ")
-    return ConnectionLost(f"no connection to {address}: {reason}")
+    return ConnectionLost(f"no connection to {address}{through}: {reason}")

@@ -2,11 +2,14 @@
 
 from collections import deque
 from collections.abc import AsyncIterator
+from typing import Any
 
 import httpx
 from google.protobuf.message import Message
 
+from vergence.transports.addresses import on_this_machine
 from vergence.transports.base import Answer, Call, ConnectionLost
+from vergence.transports.proxies import through_proxy
 from vergence_proto import codec
 from vergence_proto.errors import DepthError, NotReady, error_from_wire
 from vergence_proto.http_records import (
@@ -23,13 +26,24 @@ _HEADERS = {"Content-Type": PROTOBUF_TYPE}
 _TIMEOUT_S = 10.0
 
 
+def http_client(server: str, **options: Any) -> httpx.AsyncClient:
+    """Make a client of ``http://HOST:PORT``; on this machine, without the proxy of the environment.
+
+    Raises ConnectionLost: the proxy that the environment names cannot be used.
+    """
+    try:
+        return httpx.AsyncClient(base_url=server, trust_env=not on_this_machine(server), **options)
+    except (ImportError, ValueError) as error:  # a SOCKS proxy without its package, or no URL
+        raise ConnectionLost(f"no connection to {server}{through_proxy(server)}: {error}") from None
+
+
 class HttpTransport:
     """The :class:`~vergence.transports.base.Transport` to ``http://HOST:PORT`` (or https)."""
 
     def __init__(self, base_url: str) -> None:
         # Every call has two connections, and the number of sessions is not limited here.
         limits = httpx.Limits(max_connections=None, max_keepalive_connections=None)
-        self._http = httpx.AsyncClient(base_url=base_url, limits=limits, timeout=_TIMEOUT_S)
+        self._http = http_client(base_url, limits=limits, timeout=_TIMEOUT_S)
 
     async def open_call(self, stream_id: str) -> Call:
         self._check_open()
@@ -115,7 +129,14 @@ class _HttpCall:
 
 
 def _lost(http: httpx.AsyncClient, error: Exception) -> ConnectionLost:
-    return ConnectionLost(f"no connection to {http.base_url} ({type(error).__name__}): {error}")
+    through = _through(http)
+    return ConnectionLost(
+        f"no connection to {http.base_url}{through} ({type(error).__name__}): {error}"
+    )
+
+
+def _through(http: httpx.AsyncClient) -> str:
+    return through_proxy(str(http.base_url)) if http.trust_env else ""
 
 
 def _error_of(response: httpx.Response) -> DepthError:
@@ -128,5 +149,5 @@ def _error_of(response: httpx.Response) -> DepthError:
             return error_from_wire(problem["reason"], problem["detail"], retry_after_s)
     return NotReady(
         f"{response.url} answered {response.status_code} {response.reason_phrase}: "
-        "it speaks HTTP but does not offer Vergence streams"
+        f"it speaks HTTP but does not offer Vergence streams{through_proxy(str(response.url))}"
     )

@@ -40,16 +40,30 @@ def existing(path: Path, purpose: str) -> Path:
 
 
 def read_text(path: Path, purpose: str) -> str:
-    """Read text: UTF-8, UTF-16 or UTF-32 by its byte order mark, else UTF-8, else Latin-1.
+    """Read text of any encoding that :func:`decoded_text` knows.
 
     Raises DatasetError: there is no such file, or it is not text.
     """
-    data = existing(path, purpose).read_bytes()
-    marked = (name for mark, name in _BYTE_ORDER_MARKS.items() if data.startswith(mark))
-    text = _decoded(data, next(marked, "utf-8"))
-    if text is None or _NO_TEXT.search(text):
+    text = decoded_text(existing(path, purpose).read_bytes())
+    if text is None:
         raise DatasetError(f"{path}: expected text, {purpose}")
     return text
+
+
+def decoded_text(data: bytes) -> str | None:
+    """Decode UTF-8, UTF-16 or UTF-32 by its byte order mark, else UTF-8, else Latin-1.
+
+    The mark is taken off. None: it is not text.
+    """
+    marked = (name for mark, name in _BYTE_ORDER_MARKS.items() if data.startswith(mark))
+    encoding = next(marked, "utf-8")
+    try:
+        text = data.decode(encoding)
+    except UnicodeDecodeError:
+        if encoding != "utf-8":
+            return None
+        text = data.decode("latin-1")  # older editors wrote the degree sign and the like so
+    return None if _NO_TEXT.search(text) else text
 
 
 def read_lines(path: Path, purpose: str) -> list[str]:
@@ -59,14 +73,6 @@ def read_lines(path: Path, purpose: str) -> list[str]:
     """
     lines = (line.strip() for line in read_text(path, purpose).splitlines())
     return [line for line in lines if line and not line.startswith("#")]
-
-
-def _decoded(data: bytes, encoding: str) -> str | None:
-    try:
-        return data.decode(encoding)
-    except UnicodeDecodeError:
-        # Older editors wrote the degree sign and the like in one byte.
-        return data.decode("latin-1") if encoding == "utf-8" else None
 
 
 def numbers(words: str, count: int | None, origin: str) -> list[float]:

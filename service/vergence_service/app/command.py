@@ -26,10 +26,13 @@ _OPERATOR_ERRORS = (
 )
 
 
-def run_server(flags: Mapping[str, Any], *, config: Path | None, print_config: bool) -> None:
-    """Serve until SIGTERM or SIGINT, or print the settings. An operator's error is exit code 2.
+def run_server(
+    flags: Mapping[str, Any], *, config: Path | None, print_config: bool, until_eof: bool = False
+) -> None:
+    """Serve until a signal, or print the settings. An operator's error is exit code 2.
 
-    ``flags`` are settings by key; None is a flag that was not given.
+    ``flags`` are settings by key; None is a flag that was not given. ``until_eof``: the end of the
+    standard input stops the server too, so that it does not outlive the program that started it.
     """
     try:
         settings = load_settings(
@@ -44,7 +47,7 @@ def run_server(flags: Mapping[str, Any], *, config: Path | None, print_config: b
         )
         logging.getLogger("uvicorn.error").setLevel(logging.WARNING)  # says "started" too early
         keep_freed_memory()
-        asyncio.run(serve(settings, on_serving=_announce))
+        asyncio.run(serve(settings, on_serving=_announce, until_eof=until_eof))
     except _OPERATOR_ERRORS as error:
         sys.stderr.write(f"vergence serve: {error}\n")
         raise SystemExit(2) from None

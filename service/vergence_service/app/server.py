@@ -2,7 +2,6 @@
 
 import asyncio
 import logging
-import signal
 import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager, closing
@@ -11,6 +10,7 @@ from typing import Any
 
 from prometheus_client import CollectorRegistry
 
+from vergence_proto.stopping import STOP_SIGNALS, on_end_of_input, on_signals
 from vergence_proto.types import Delivery
 from vergence_service.app.http import serving_http
 from vergence_service.app.zenoh import ZenohTransport, serving_zenoh
@@ -152,16 +152,18 @@ async def running(
             )
 
 
-async def serve(settings: Settings, *, on_serving: Callable[[Running], None]) -> None:
-    """Serve until SIGTERM or SIGINT, then drain.
+async def serve(
+    settings: Settings, *, on_serving: Callable[[Running], None], until_eof: bool = False
+) -> None:
+    """Serve until SIGTERM, SIGINT or SIGHUP, then drain; ``until_eof``: or until the input ends.
 
     Raises FileNotFoundError, ManifestError or ProviderUnavailable if the model cannot be loaded;
     PortTaken, ExtraMissing or ZenohUnreachable if a transport cannot start.
     """
     stop = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, stop.set)
+    on_signals(STOP_SIGNALS, lambda _: stop.set())
+    if until_eof:
+        on_end_of_input(lambda _: stop.set())
     with closing(make_model(settings)) as model:
         async with running(settings, model) as server:
             on_serving(server)

@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 from starlette.requests import ClientDisconnect
 
 from vergence_proto.codec.image_files import ImageKind, image_kind
+from vergence_proto.datasets.files import decoded_text
 from vergence_proto.errors import BadSequence, UploadTooLarge
 from vergence_service.jobs.archives import ArchiveLimits, unpacking
 from vergence_service.threads import ThreadPool
@@ -234,7 +235,7 @@ def _sequence_form(path: Path) -> SequenceForm:
     if path.stat().st_size > _LARGEST_JSON:
         raise UploadTooLarge(f"expected a JSON 'sequence' of at most {_LARGEST_JSON} bytes")
     try:
-        return SequenceForm.model_validate_json(path.read_bytes())
+        return SequenceForm.model_validate_json(decoded_text(path.read_bytes()) or "")
     except ValidationError as error:
         problems = "; ".join(
             f"{'.'.join(map(str, each['loc']))}: {each['msg']}" for each in error.errors()
