@@ -20,8 +20,8 @@ A moving camera, live: one task submits frames, another reads results::
 
 Everything public is in ``__all__``, :mod:`vergence.ros` and :mod:`vergence.depth_formats`; the
 other modules may change. The errors that a server
-raises are those of :mod:`vergence_proto.errors`; :class:`NotOpen` and :class:`ConnectionLost` are
-the client's own.
+raises are those of :mod:`vergence_proto.errors`; :class:`NotOpen`, :class:`WrongDelivery` and
+:class:`ConnectionLost` are the client's own.
 """
 
 from importlib import import_module

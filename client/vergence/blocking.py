@@ -198,7 +198,7 @@ class BlockingSession:
             An image is not uint8, or has another shape than those above.
         BadPose
             The pose is not finite, or its rotation is not orthonormal with determinant +1.
-        RuntimeError
+        WrongDelivery
             The session's delivery is EVERY, which must not drop frames; use :meth:`step`.
         NotOpen
             The session is not open, or has ended.

@@ -6,3 +6,10 @@ class NotOpen(RuntimeError):
 
     No request was sent. The message says what to open.
     """
+
+
+class WrongDelivery(RuntimeError):
+    """A session was asked for what its delivery excludes: ``submit`` may drop a frame, EVERY not.
+
+    Nothing was sent. The message says which method to use.
+    """

@@ -2,7 +2,7 @@
 
 from vergence.blocking import BlockingClient, BlockingSession, depth
 from vergence.client import DepthClient
-from vergence.errors import NotOpen
+from vergence.errors import NotOpen, WrongDelivery
 from vergence.info import ModelInfo, ServerInfo, StreamInfo
 from vergence.reprojection import DepthView, View, reproject
 from vergence.results import DepthResult, Drops, EventKind, SessionEvent
@@ -109,6 +109,7 @@ __all__ = [
     "UnknownStream",
     "UploadTooLarge",
     "View",
+    "WrongDelivery",
     "depth",
     "reproject",
 ]

@@ -2,6 +2,7 @@
 
 import asyncio
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vergence.connection import RESET, StreamConnection
-from vergence.errors import NotOpen
+from vergence.errors import NotOpen, WrongDelivery
 from vergence.in_flight import FrameInFlight, FramesInFlight
 from vergence.info import ModelInfo
 from vergence.info_codec import model_info_from_proto
@@ -63,8 +64,12 @@ class DepthSession:
     If the connection breaks, the session reconnects and resumes the stream, for as long as the
     server keeps its state. ``on_event`` reports it, and the next result's origin is RESUMED.
 
-    Every method but ``__aenter__`` raises :class:`NotOpen` before ``async with``.
+    Every method but ``__aenter__`` raises :class:`NotOpen` before ``async with``. A session that is
+    forgotten while it is open gives a ResourceWarning, as an open file does; its stream stays open
+    until the client is closed.
     """
+
+    _left_open = False
 
     def __init__(self, setup: SessionSetup, /) -> None:
         self._setup = setup
@@ -105,12 +110,24 @@ class DepthSession:
         if self._responses.opened is not None:
             raise NotOpen("this session was opened before; make a new one with open_session()")
         await self._connection.open()
+        self._left_open = True
         self._next_id = self._opened().last_frame_id + 1
         return self
 
     async def __aexit__(self, *exc_info: object) -> None:
         """End the stream; the server frees its state."""
+        self._left_open = False
         await self._connection.close()
+
+    def __del__(self) -> None:
+        """Warn if nobody has left the ``async with`` (or ``with``) of this session."""
+        if self._left_open:
+            warnings.warn(
+                f"session {self.stream_id!r} was not closed; use it inside async with, or with",
+                ResourceWarning,
+                stacklevel=2,
+                source=self,
+            )
 
     @property
     def stream_id(self) -> str:
@@ -233,7 +250,7 @@ class DepthSession:
             An image is not uint8, or has another shape than those above.
         BadPose
             The pose is not finite, or its rotation is not orthonormal with determinant +1.
-        RuntimeError
+        WrongDelivery
             The session's delivery is EVERY, which must not drop frames; use :meth:`step`.
         NotOpen
             The session is not open, or has ended.
@@ -242,7 +259,7 @@ class DepthSession:
         """
         self._opened()
         if self._setup.delivery is Delivery.EVERY:
-            raise RuntimeError("submit() may drop frames and this session is lossless: use step()")
+            raise WrongDelivery("submit() may drop frames and this session is lossless: use step()")
         self._check_open()
         if not (self._connection.up and self._in_flight.has_room):
             self._in_flight.count(at_source=1)

@@ -25,8 +25,6 @@ _BACKGROUND_NICENESS = 5
 _SLICE_S = 0.02
 # Pieces wait in memory until they are used. Those of results are up to a megabyte large.
 _MOST_PIECES = 16
-# Pieces wait in memory until they are used. Those of results are up to a megabyte large.
-_MOST_PIECES = 16
 
 
 async def to_the_end(work: Coroutine[Any, Any, Result]) -> Result:

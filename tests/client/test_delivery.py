@@ -9,7 +9,14 @@ from tests.support.models import RAISES, RecallModel
 from tests.support.polling import eventually
 from tests.support.server import running_server
 from tests.support.session_frames import step, submit
-from vergence import Delivery, DepthClient, DepthSession, FrameStale, ModelFailed
+from vergence import (
+    Delivery,
+    DepthClient,
+    DepthSession,
+    FrameStale,
+    ModelFailed,
+    WrongDelivery,
+)
 
 
 async def test_live_results_come_by_iteration_until_the_end(client: DepthClient) -> None:
@@ -82,7 +89,7 @@ async def test_a_lossless_session_does_not_take_frames_that_it_might_drop(
     client: DepthClient,
 ) -> None:
     async with client.open_session(RIG, delivery=Delivery.EVERY) as session:
-        with pytest.raises(RuntimeError, match=r"use step\(\)"):
+        with pytest.raises(WrongDelivery, match=r"use step\(\)"):
             submit(session, 1)
 
 

@@ -1,5 +1,6 @@
 """Mistakes of a program raise an error of the project's own, at the call that makes them."""
 
+import gc
 import inspect
 import math
 from collections.abc import Callable
@@ -88,6 +89,23 @@ async def test_a_session_opens_once_and_takes_no_frame_after_its_end(client: Dep
         session.submit(FRAME.left, FRAME.right)
     with pytest.raises(NotOpen, match="open_session"):
         await session.__aenter__()
+
+
+async def test_a_session_that_is_forgotten_open_warns(client: DepthClient) -> None:
+    async def open_and_forget() -> None:
+        await client.open_session(RIG, stream_id="forgotten").__aenter__()
+        gc.collect()
+
+    with pytest.warns(ResourceWarning, match="'forgotten' was not closed"):
+        await open_and_forget()
+
+
+async def test_a_session_that_was_left_or_never_opened_does_not_warn(client: DepthClient) -> None:
+    client.open_session(RIG)
+    async with client.open_session(RIG) as session:
+        await session.step(FRAME.left, FRAME.right)
+    del session
+    gc.collect()  # any warning would be an error here
 
 
 def test_a_blocking_client_outside_with_says_how_to_open_it() -> None:

@@ -15,7 +15,6 @@ from vergence_proto.datasets import DATASETS, find_sources, open_source
 from vergence_proto.geometry import RectifiedRig
 
 ALL_TREES = {**trees.TREES, **field.TREES}
-SHARED = {"middlebury", "eth3d"}  # one calibration format; its folders identify ETH3D
 
 
 def _set_visible(mask: Any, expected: Any) -> None:
@@ -283,8 +282,19 @@ def everything(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_kind_finds_its_own_tree_and_no_other(kind: str, everything: Path) -> None:
     found = [Path(spec.split(":", 1)[1]) for spec in find_sources(f"{kind}:{everything}")]
     takes = {path.relative_to(everything).parts[0] for path in found}
-    assert kind in takes
-    assert takes <= (SHARED if kind in SHARED else {kind})
+    assert takes == {kind}
+
+
+def test_eth3d_is_known_by_its_folder_or_by_the_files_of_colmap(tmp_path: Path) -> None:
+    scene = trees.eth3d_scene(tmp_path)
+    moved = scene.rename(tmp_path / "playground_1l")
+    assert find_sources(f"eth3d:{tmp_path}") == [f"eth3d:{moved}"]
+    assert find_sources(f"middlebury:{tmp_path}") == []
+    (moved / "cameras.txt").unlink()
+    assert find_sources(f"eth3d:{tmp_path}") == []
+    assert find_sources(f"middlebury:{tmp_path}") == [f"middlebury:{moved}"]
+    back = moved.rename(scene)
+    assert find_sources(f"eth3d:{tmp_path}") == [f"eth3d:{back}"]
 
 
 @pytest.mark.parametrize("kind", field.TREES)
@@ -309,23 +319,57 @@ def test_what_windows_adds_to_text_is_no_data(kind: str, tmp_path: Path) -> None
             assert_same_pose(second.frame.pose.world_from_left, expected, 0)
 
 
+# The file of one frame's truth: of the second frame, of a pair's only one.
 TRUTH_OF_ONE = {
+    "vergence": "frame_0001_gt.npz",
+    "kitti2012": "disp_noc/*_10.png disp_occ/*_10.png",
+    "kitti2015": "disp_noc_0/*_10.png disp_occ_0/*_10.png",
+    "sceneflow": "disparity/TRAIN/A/0000/left/0007.pfm",
+    "tartanair": "depth_left/000001_left_depth.npy",
+    "middlebury": "disp0.pfm",
+    "eth3d": "disp0GT.pfm",
     "sintel": "disparities/alley_1/frame_0002.png",
+    "spring": "disp1_left_0002.dsp5",
     "vkitti2": "depth_00001.png",
     "drivingstereo": "train-disparity-map/*/*-602.png",
+    "middlebury2006": "disp1.png",
     "kittiraw": "groundtruth/image_02/0000000001.png",
+    "flyingthings": "disparity/*/*.pfm",
+    "booster": "disp_00.npy",
+    "instereo2k": "left_disp.png",
     "irs": "d_9.exr",
     "apollo": "disparity/*26454_Camera_5.png",
 }
+ONE_TRUTH_FOR_ALL_FRAMES = {"booster"}
+NO_TRUTH = {"kitti", "euroc"}
+
+
+def test_no_kind_is_forgotten() -> None:
+    assert {*TRUTH_OF_ONE, *NO_TRUTH} == set(DATASETS)
 
 
 @pytest.mark.parametrize("kind", TRUTH_OF_ONE)
 def test_a_frame_whose_truth_is_not_there_has_none(kind: str, tmp_path: Path) -> None:
-    path = field.TREES[kind](tmp_path)
-    (truth,) = tmp_path.rglob(TRUTH_OF_ONE[kind])
-    truth.unlink()
-    known = [each.truth_px is not None for each in open_source(f"{kind}:{path}")]
-    assert known == [True, False, True]
+    path = ALL_TREES[kind](tmp_path)
+    if kind == "spring":  # its tree has no truth, which is HDF5
+        for number in (1, 2, 3):
+            truth = path / "disp1_left" / f"disp1_left_{number:04d}.dsp5"
+            truth.parent.mkdir(exist_ok=True)
+            truth.touch()
+    spec = f"{kind}:{path}{'?fx=20' if kind == 'sceneflow' else ''}"
+    before = open_source(spec)
+    for pattern in TRUTH_OF_ONE[kind].split():
+        (truth,) = tmp_path.rglob(pattern)
+        truth.unlink()
+    source = open_source(spec)
+    assert all(each.read_truth is not None for each in before.files)
+    known = [each.read_truth is not None for each in source.files]
+    if kind in ONE_TRUTH_FOR_ALL_FRAMES or len(source) == 1:
+        assert known == [False] * len(before)
+    else:
+        assert known == [True, False, True]
+        assert "1 of 3 frames have no ground truth" in source.notes
+    assert source[known.index(False)].truth_px is None
 
 
 IMAGES_ALONE = {

@@ -67,6 +67,68 @@ async def test_closing_waits_for_outstanding_work_where_that_is_asked_for() -> N
     assert finished == [0, 1, 2]
 
 
+@pytest.mark.parametrize("cancelled_times", [1, 2])
+@pytest.mark.parametrize("outstanding", [1, 3])
+async def test_a_cancelled_caller_waits_for_outstanding_work_where_that_is_asked_for(
+    outstanding: int, cancelled_times: int
+) -> None:
+    """Also for the task whose result it was waiting for, and if it is cancelled again."""
+    may_finish = asyncio.Event()
+    all_begun = asyncio.Event()
+    begun: list[int] = []
+    finished: list[int] = []
+
+    async def work(item: int) -> None:
+        begun.append(item)
+        if len(begun) == outstanding:
+            all_begun.set()
+        await may_finish.wait()
+        finished.append(item)
+
+    async def read_all() -> None:
+        items = count_to(9)
+        results = in_order(items, work, limit=outstanding, cancel_rest=False)
+        async with aclosing(items), aclosing(results):
+            async for _ in results:
+                pass
+
+    reading = asyncio.create_task(read_all())
+    await all_begun.wait()
+    for _ in range(cancelled_times):
+        reading.cancel()
+        await asyncio.wait([reading], timeout=0)
+        assert not reading.done()
+    may_finish.set()
+    with pytest.raises(asyncio.CancelledError):
+        await reading
+    assert finished == list(range(outstanding))
+
+
+async def test_a_cancelled_caller_cancels_outstanding_work() -> None:
+    all_begun = asyncio.Event()
+    cancelled: list[int] = []
+
+    async def work(item: int) -> None:
+        if item == 2:
+            all_begun.set()
+        try:
+            await asyncio.Event().wait()
+        except asyncio.CancelledError:
+            cancelled.append(item)
+            raise
+
+    async def read_all() -> None:
+        async for _ in in_order(count_to(9), work, limit=3):
+            pass
+
+    reading = asyncio.create_task(read_all())
+    await all_begun.wait()
+    reading.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await reading
+    assert cancelled == [0, 1, 2]
+
+
 async def test_a_failure_of_the_work_is_raised_in_its_turn() -> None:
     async def work(item: int) -> int:
         if item == 1:

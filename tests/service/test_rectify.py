@@ -1,6 +1,7 @@
 """Rectification: what is at one point in space is on one row, at the disparity of its depth."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -13,7 +14,8 @@ from tests.support.server import running_server
 from vergence_proto.errors import BadCalibration
 from vergence_proto.geometry import Pose
 from vergence_proto.types import Distortion, Intrinsics, PoseSample, StereoFrame, StereoRig
-from vergence_service.streams.rectify import Rectifier
+from vergence_service.streams.rectify import Rectifier, check_rig
+from vergence_service.streams.search_window import SearchReach
 from vergence_service.streams.stream import StreamConfig
 
 WIDTH, HEIGHT = 320, 240
@@ -138,7 +140,21 @@ def one_fisheye(rig: StereoRig) -> StereoRig:
     return StereoRig(rig.left, RIGS["fisheye"].right, rig.left_from_right)
 
 
-@pytest.mark.parametrize("spoil", [turned_around, one_above_the_other, one_fisheye])
-def test_a_rig_that_cannot_be_rectified_is_refused(spoil: Callable[[StereoRig], StereoRig]) -> None:
-    with pytest.raises(BadCalibration, match="expected"):
-        Rectifier.of(spoil(RIGS["pinhole"]), REACH)
+def seen_by_nobody(rig: StereoRig) -> StereoRig:
+    """The principal point is so far away that the image holds nothing of the common view."""
+    left = replace(rig.left, cx=1e6)
+    return StereoRig(left, rig.right, rig.left_from_right)
+
+
+@pytest.mark.parametrize("refuse", [Rectifier.of, check_rig])
+@pytest.mark.parametrize("spoil", [turned_around, one_above_the_other, one_fisheye, seen_by_nobody])
+def test_a_rig_that_cannot_be_rectified_is_refused(
+    spoil: Callable[[StereoRig], StereoRig], refuse: Callable[[StereoRig, SearchReach], object]
+) -> None:
+    with pytest.raises(BadCalibration, match=r"expected|no pixel"):
+        refuse(spoil(RIGS["pinhole"]), REACH)
+
+
+@pytest.mark.parametrize("rig", [*RIGS.values(), StereoRig.from_rectified(RIG)])
+def test_a_rig_that_can_be_rectified_passes_the_check(rig: StereoRig) -> None:
+    check_rig(rig, REACH)

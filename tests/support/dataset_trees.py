@@ -239,6 +239,8 @@ def middlebury_scene(root: Path, truth: str = "disp0.pfm") -> Path:
 def eth3d_scene(root: Path) -> Path:
     scene = middlebury_scene(root / "two_view_training", truth="unused.pfm")
     (scene / "unused.pfm").unlink()
+    for name in ("cameras.txt", "images.txt"):
+        write_lines(scene / name, "# COLMAP's")
     truth = root / "two_view_training_gt" / scene.name
     write_pfm_by_hand(truth / "disp0GT.pfm", a_disparity())
     mask = np.where(a_disparity() > 5, 128, 255).astype(np.uint8)

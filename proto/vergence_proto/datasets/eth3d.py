@@ -1,7 +1,13 @@
 """ETH3D two-view: ``eth3d:ROOT/two_view_training/playground_1l``.
 
-Calibration and images have Middlebury's layout. The truth is in a separate folder,
-``ROOT/two_view_training_gt/playground_1l``, or in the folder of the scene.
+::
+
+    two_view_training/SCENE       calib.txt im0.png im1.png    as Middlebury's
+                                  cameras.txt images.txt       COLMAP's; not read
+    two_view_training_gt/SCENE    disp0GT.pfm mask0nocc.png    or in the folder of the scene
+
+A scene with Middlebury's calibration is ETH3D's if COLMAP's ``cameras.txt`` is beside it, or if it
+is in a folder ``two_view_*``; else it is Middlebury's.
 """
 
 from pathlib import Path
@@ -11,8 +17,8 @@ from vergence_proto.datasets.source import StereoSource
 
 
 def find(root: Path) -> list[Path]:
-    """List every scene in or under ``root``."""
-    return middlebury.find(root)
+    """List every scene of ETH3D in or under ``root``."""
+    return [path for path in middlebury.find_all(root) if middlebury.is_eth3d(path)]
 
 
 def open_path(path: Path) -> StereoSource:

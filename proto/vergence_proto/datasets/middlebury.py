@@ -28,8 +28,19 @@ _VISIBLE = 255
 
 
 def find(root: Path) -> list[Path]:
-    """List every scene in or under ``root``."""
+    """List every scene of Middlebury in or under ``root``."""
+    return [path for path in find_all(root) if not is_eth3d(path)]
+
+
+def find_all(root: Path) -> list[Path]:
+    """List every scene with this calibration in or under ``root``: Middlebury's and ETH3D's."""
     return [path.parent for path in found(root, "calib.txt") if _image(path.parent, 0).is_file()]
+
+
+def is_eth3d(path: Path) -> bool:
+    """Tell whether a scene with this calibration is ETH3D's, by the files and folders about it."""
+    parent = path.absolute().parent.name
+    return (path / "cameras.txt").is_file() or parent.startswith("two_view")
 
 
 def open_path(path: Path) -> StereoSource:

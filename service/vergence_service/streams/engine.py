@@ -28,7 +28,7 @@ from vergence_service.inference.model import RecurrentState, Step, StereoView, s
 from vergence_service.metrics import Metrics
 from vergence_service.streams.continuity import ContinuityLimits
 from vergence_service.streams.conversion import SteppedFrame, view_from_frame
-from vergence_service.streams.rectify import Rectifier
+from vergence_service.streams.rectify import Rectifier, check_rig
 from vergence_service.streams.search_window import SearchReach
 from vergence_service.streams.stream import Attachment, Notice, NoticeKind, Stream, StreamConfig
 from vergence_service.streams.table import StreamTable
@@ -125,6 +125,7 @@ class DepthEngine:
         StreamExists if it is in use, and Quota, StreamLimit or StateMemory if a limit is reached.
         """
         self._check_model(config)
+        await self._check_opening(config.rig)
         rectifier = await self._rectifier(config.rig)
         searched = rectifier.window.rig
         reserve = state_bytes(self.card, searched.height, searched.width)
@@ -184,6 +185,11 @@ class DepthEngine:
             stream, decode, self.threads.live, arrived_s=arrived_s, max_age_s=max_age_s
         )
 
+    async def check_offline(self, rig: StereoRig) -> None:
+        """Refuse what :meth:`open_offline` would refuse, with the same errors."""
+        await self._check_opening(rig)
+        await self.threads.background.run(check_rig, rig, self._reach)
+
     async def open_offline(
         self, config: StreamConfig, *, state: RecurrentState | None = None
     ) -> Stream:
@@ -195,6 +201,7 @@ class DepthEngine:
         Raises NotReady or Draining if no streams are accepted, BadCalibration if the rig cannot be
         rectified, and FrameTooLarge if its images are too large.
         """
+        await self._check_opening(config.rig)
         rectifier = await self._rectifier(config.rig)
         origin = Origin.COLD_START if state is None else Origin.WARM
         return Stream(
@@ -258,7 +265,7 @@ class DepthEngine:
                 "continue with these"
             )
 
-    async def _rectifier(self, rig: StereoRig) -> Rectifier:
+    async def _check_opening(self, rig: StereoRig) -> None:
         with suppress(TimeoutError):
             async with asyncio.timeout(_LOADING_PATIENCE_S):
                 await self._started.wait()
@@ -268,6 +275,8 @@ class DepthEngine:
             raise FrameTooLarge(
                 f"expected at most {self.max_pixels} pixels per image, got {width}x{height}"
             )
+
+    async def _rectifier(self, rig: StereoRig) -> Rectifier:
         return await self.threads.background.run(Rectifier.of, rig, self._reach)
 
     async def _step(

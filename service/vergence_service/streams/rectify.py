@@ -26,6 +26,28 @@ class _Maps:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Cameras:
+    """The rectified cameras of a rig, and how the original ones see them."""
+
+    rig: RectifiedRig
+    rotations: list[Matrix]  # [3, 3], rectified_from_left and rectified_from_right
+    projections: list[Matrix]  # [3, 3], the intrinsics of the rectified cameras
+
+
+def check_rig(rig: StereoRig, reach: SearchReach) -> None:
+    """Refuse a rig that :meth:`Rectifier.of` cannot rectify.
+
+    Raises BadCalibration, as :meth:`Rectifier.of` does.
+    """
+    rectified = rig.as_rectified()
+    if rectified is None:
+        cameras = _rectified_cameras(rig)
+        _seen(_left_maps(rig, cameras))
+        rectified = cameras.rig
+    SearchWindow.of(rectified, reach)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Rectifier:
     """Makes the model's images from those of one rig."""
 
@@ -49,47 +71,13 @@ class Rectifier:
 
     @classmethod
     def _from_cameras(cls, rig: StereoRig, reach: SearchReach) -> Self:
-        fisheye = {
-            camera.distortion is Distortion.KANNALA_BRANDT for camera in (rig.left, rig.right)
-        }
-        if len(fisheye) > 1:
-            raise BadCalibration("expected both cameras to be fisheye or neither, got one of each")
-        projections, rotations = (_fisheye if fisheye.pop() else _pinhole)(rig)
-        (left_k, right_k) = (projection[:, :3] for projection in projections)
-        focal_px = right_k[0, 0]
-        baseline_m = -projections[1][0, 3] / focal_px
-        if not (np.isfinite([left_k, right_k]).all() and focal_px > 0 and left_k[1, 1] > 0):
-            raise BadCalibration(
-                "the rig has no rectification; check distortion and left_from_right"
-            )
-        if not baseline_m > 0:
-            raise BadCalibration(
-                "expected the right camera to the right of the left one (left_from_right with a "
-                f"translation mostly along +x), got {rig.left_from_right.translation_m.tolist()}"
-            )
-        width, height = rig.left.width, rig.left.height
-        rectified = RectifiedRig(
-            width,
-            height,
-            float(left_k[0, 0]),
-            float(left_k[1, 1]),
-            float(left_k[0, 2]),
-            float(right_k[0, 2]),
-            float(left_k[1, 2]),
-            float(baseline_m),
-        )
-        left_maps, right_maps = (
-            _maps(camera, rotation, matrix)
-            for camera, rotation, matrix in zip(
-                (rig.left, rig.right), rotations, (left_k, right_k), strict=True
-            )
-        )
-        seen = left_maps.remap(np.full((height, width), 255, np.uint8)) == 255
-        if not seen.any():
-            raise BadCalibration("no pixel of the rectified left image is seen by the camera")
-        left_from_rectified = Pose(rotations[0].T.copy(), np.zeros(3))
-        window = SearchWindow.of(rectified, reach)
-        return cls(rectified, window, left_from_rectified, (left_maps, right_maps), seen)
+        cameras = _rectified_cameras(rig)
+        left_maps = _left_maps(rig, cameras)
+        seen = _seen(left_maps)
+        right_maps = _maps(rig.right, cameras.rotations[1], cameras.projections[1])
+        left_from_rectified = Pose(cameras.rotations[0].T.copy(), np.zeros(3))
+        window = SearchWindow.of(cameras.rig, reach)
+        return cls(cameras.rig, window, left_from_rectified, (left_maps, right_maps), seen)
 
     def rectify(self, left: Image, right: Image) -> tuple[Image, Image]:
         """The pair as the model sees it, from images as the cameras took them."""
@@ -111,6 +99,47 @@ class Rectifier:
     def sigma_px(self, sigma_px: Plane) -> Plane:
         """Sigma [H, W] of ``rig`` from the model's."""
         return self.window.sigma_px(sigma_px, self.rig.height, self.rig.width)
+
+
+def _rectified_cameras(rig: StereoRig) -> _Cameras:
+    fisheye = {camera.distortion is Distortion.KANNALA_BRANDT for camera in (rig.left, rig.right)}
+    if len(fisheye) > 1:
+        raise BadCalibration("expected both cameras to be fisheye or neither, got one of each")
+    projections, rotations = (_fisheye if fisheye.pop() else _pinhole)(rig)
+    (left_k, right_k) = (projection[:, :3] for projection in projections)
+    focal_px = right_k[0, 0]
+    baseline_m = -projections[1][0, 3] / focal_px
+    if not (np.isfinite([left_k, right_k]).all() and focal_px > 0 and left_k[1, 1] > 0):
+        raise BadCalibration("the rig has no rectification; check distortion and left_from_right")
+    if not baseline_m > 0:
+        raise BadCalibration(
+            "expected the right camera to the right of the left one (left_from_right with a "
+            f"translation mostly along +x), got {rig.left_from_right.translation_m.tolist()}"
+        )
+    rectified = RectifiedRig(
+        rig.left.width,
+        rig.left.height,
+        float(left_k[0, 0]),
+        float(left_k[1, 1]),
+        float(left_k[0, 2]),
+        float(right_k[0, 2]),
+        float(left_k[1, 2]),
+        float(baseline_m),
+    )
+    return _Cameras(rectified, rotations, [left_k, right_k])
+
+
+def _left_maps(rig: StereoRig, cameras: _Cameras) -> _Maps:
+    return _maps(rig.left, cameras.rotations[0], cameras.projections[0])
+
+
+def _seen(left_maps: _Maps) -> NDArray[np.bool_]:
+    """Return where the left camera sees the rectified image, bool [H, W]."""
+    white = np.full(left_maps.fraction.shape, 255, np.uint8)
+    seen = left_maps.remap(white) == 255
+    if not seen.any():
+        raise BadCalibration("no pixel of the rectified left image is seen by the camera")
+    return seen
 
 
 def _pinhole(rig: StereoRig) -> tuple[list[Matrix], list[Matrix]]:
