@@ -1,7 +1,7 @@
 """The law of ordered work: results keep the order of the items, and the limit holds."""
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from contextlib import aclosing
 
 import pytest
@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from vergence_proto.ordered import in_order
 
 
-async def count_to(number: int) -> AsyncIterator[int]:
+async def count_to(number: int) -> AsyncGenerator[int, None]:
     for each in range(number):
         yield each
 

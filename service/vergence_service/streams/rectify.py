@@ -136,7 +136,7 @@ def _left_maps(rig: StereoRig, cameras: _Cameras) -> _Maps:
 def _seen(left_maps: _Maps) -> NDArray[np.bool_]:
     """Return where the left camera sees the rectified image, bool [H, W]."""
     white = np.full(left_maps.fraction.shape, 255, np.uint8)
-    seen = left_maps.remap(white) == 255
+    seen = np.asarray(left_maps.remap(white) == 255)
     if not seen.any():
         raise BadCalibration("no pixel of the rectified left image is seen by the camera")
     return seen
