@@ -39,7 +39,7 @@ def serve(
     --print-config lists them. Flags win over variables, and variables over the file. When live
     streams are served, it prints one line: "listening grpc=HOST:PORT http=HOST:PORT", and with
     Zenoh also " zenoh=ENDPOINT". Lossless streams, pairs and sequences then wait for the larger
-    graphs that they need, which are loaded in the background.
+    graphs that they need, until it prints "ready".
     """
     flags: dict[str, Any] = {
         "grpc.port": grpc_port,

@@ -2,8 +2,10 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,7 +13,16 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.support.textured_wall import DISPARITY_PX, HEIGHT, WIDTH, write_pair, write_wall
+from tests.support.mjpeg_camera import mjpeg_camera
+from tests.support.textured_wall import (
+    BASELINE_M,
+    DISPARITY_PX,
+    FX,
+    HEIGHT,
+    WIDTH,
+    write_pair,
+    write_wall,
+)
 from vergence_proto.instruction_set import instruction_set
 
 PATIENCE_S = 60.0
@@ -109,6 +120,54 @@ def test_run_takes_a_lone_pair_and_starts_a_server_for_it(tmp_path: Path) -> Non
     assert done.returncode == 0, done.stderr
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["disp.png"]
     assert json.loads((tmp_path / "j").read_text())["epe_px"] is None  # the pair has no truth
+
+
+def test_run_takes_two_images_and_says_what_is_missing(server: str, tmp_path: Path) -> None:
+    pair = write_pair(tmp_path / "pair")
+    images = (pair / "left.png", pair / "right.png")
+    done = vergence("run", *images, "--server", server, "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert "without a calibration there is disparity in pixels" in " ".join(done.stdout.split())
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["disp.png", "sheet.png"]
+    metres = ("--fx", FX, "--baseline", BASELINE_M, "--no-pictures")
+    done = vergence("run", *images, *metres, "--server", server, "--out", tmp_path / "metres")
+    assert done.returncode == 0, done.stderr
+    assert "without a calibration" not in done.stdout
+    disparity, depth = (
+        cv2.imread(str(tmp_path / "metres" / name), cv2.IMREAD_UNCHANGED)
+        for name in ("disp.png", "depth.png")
+    )
+    assert disparity is not None
+    assert depth is not None
+    # Both are stored in steps of 1/256.
+    far = disparity > 0
+    np.testing.assert_allclose(
+        depth[far] / 256, FX * BASELINE_M / (disparity[far] / 256), rtol=0.01
+    )
+
+
+def test_run_reads_a_camera_until_ctrl_c(server: str, tmp_path: Path) -> None:
+    with mjpeg_camera(WIDTH, HEIGHT) as address:
+        command = [sys.executable, "-m", "vergence", "run", f"camera:{address}"]
+        with subprocess.Popen(
+            [*command, "--server", server, "--out", str(tmp_path / "out")],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        ) as process:
+            eventually_there(tmp_path / "out" / "0002.png")
+            process.send_signal(signal.SIGINT)
+            said, _ = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0, said
+    assert "answered" in said
+    assert (tmp_path / "out" / "sheet.png").exists()
+
+
+def eventually_there(path: Path) -> None:
+    until_s = time.monotonic() + PATIENCE_S
+    while not path.exists():
+        assert time.monotonic() < until_s, f"no {path}"
+        time.sleep(0.02)
 
 
 def test_run_at_a_rate_accounts_for_every_frame(wall: Path, server: str, tmp_path: Path) -> None:

@@ -99,7 +99,24 @@ def _demo(
 
 @app.command("run")
 def _run(
-    source: Annotated[str, typer.Argument(help="KIND:PATH, as vergence:DIR or kitti:DIR.")],
+    source: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="SOURCE | LEFT RIGHT",
+            help="A folder in the layout of a data set, KIND:PATH, two images, a side-by-side "
+            "video, or camera:0.",
+        ),
+    ],
+    calib: Annotated[
+        Path | None,
+        typer.Option(help="Calibration of images or a camera, as vergence calib reads it."),
+    ] = None,
+    fx: Annotated[
+        float | None, typer.Option(min=0, help="Focal length of rectified images, in pixels.")
+    ] = None,
+    baseline: Annotated[
+        float | None, typer.Option(min=0, help="Distance of the two cameras, in metres.")
+    ] = None,
     server: Annotated[
         str | None,
         typer.Option(
@@ -114,27 +131,36 @@ def _run(
         str,
         typer.Option(help="max: every frame, losslessly. HZ or source: live, newest frames win."),
     ] = "max",
+    frames: Annotated[int | None, typer.Option(min=1, help="Stop after so many frames.")] = None,
     iterations: Annotated[
         int, typer.Option(min=0, help="Refinement iterations per frame; 0: the server's default.")
     ] = 0,
     pictures: Annotated[
-        bool, typer.Option("--pictures", help="Write a picture of some frames.")
-    ] = False,
+        bool | None,
+        typer.Option(
+            "--pictures/--no-pictures",
+            help="Draw some frames; by default those of images and cameras.",
+        ),
+    ] = None,
     json: JsonOption = None,
 ) -> None:
-    """Stream a sequence or a pair from disk and write its disparity.
+    """Stream files or a camera and write disparity.
 
     The files are 16-bit PNG in KITTI's convention (x256, 0 = no value): 0000.png, 0001.png, ...
-    for a sequence, disp.png for a pair.
+    for a sequence, disp.png for a pair. Images and cameras with --calib, or --fx and --baseline,
+    give depth too: depth/0000.png or depth.png, metres x256.
     """
     from vergence.cli.run import run
+    from vergence.cli.sources import CalibrationFlags
 
     _await(
         run(
             source,
+            CalibrationFlags(calib, fx, baseline),
             server=server,
             out=out,
             rate=rate,
+            frames=frames,
             iterations=iterations,
             pictures=pictures,
             json=json,

@@ -8,10 +8,10 @@ import cv2
 from vergence.cli.errors import CliError
 from vergence.cli.pictures import Row, sheet
 from vergence.cli.streaming import AnsweredFrame
-from vergence_proto.datasets import StereoSource
-from vergence_proto.types import Origin
+from vergence_proto.types import Origin, StereoRig
 
 _SHEET_ROWS = 4
+_SHOWN_OF_A_CAMERA = (0, 30, 90, 270)
 
 
 def row_of(answered: AnsweredFrame) -> Row:
@@ -32,14 +32,18 @@ def row_of(answered: AnsweredFrame) -> Row:
     )
 
 
-def title_of(source: StereoSource, model_name: str) -> str:
+def title_of(name: str, rig: StereoRig, model_name: str) -> str:
     """Return the title of a picture or a table: model, source and image size."""
-    camera = source.rig.left
-    return f"Vergence {model_name}: {source.name}, {camera.width} x {camera.height}"
+    return f"Vergence {model_name}: {name}, {rig.left.width} x {rig.left.height}"
 
 
-def shown_in_sheet(count: int) -> list[int]:
-    """Choose which of ``count`` frames a sheet shows: the first, the last, and some between."""
+def shown_in_sheet(count: int | None) -> list[int]:
+    """Choose which of ``count`` frames a sheet shows: the first, the last, and some between.
+
+    If the count is not known, they are seconds apart.
+    """
+    if count is None:
+        return list(_SHOWN_OF_A_CAMERA)
     rows = min(_SHEET_ROWS, count)
     return sorted({round(row * (count - 1) / max(rows - 1, 1)) for row in range(rows)})
 

@@ -41,7 +41,7 @@ async def demo(
         DepthClient(server) as client,
         client.open_session(source.rig, delivery=Delivery.EVERY) as session,
     ):
-        title = title_of(source, session.model.name)
+        title = title_of(source.name, source.rig, session.model.name)
         answers: list[AnsweredFrame] = []
         with progress_bar(console) as progress:
             bar = progress.add_task("streaming", total=len(filmed), note="")

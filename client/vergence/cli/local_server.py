@@ -18,7 +18,8 @@ from vergence.transports.addresses import DEFAULT_SERVER
 from vergence_proto.errors import DepthError
 from vergence_proto.extras import how_to_install
 
-_READY = re.compile(r"listening grpc=(\S+) http=(\S+)")
+_LISTENING = re.compile(r"listening grpc=(\S+) http=(\S+)")
+_READY = "ready"
 _START_TIMEOUT_S = 60.0  # loading and warming a model up takes seconds on a small machine
 _STOP_TIMEOUT_S = 15.0
 _LOOK_S = 1.0
@@ -90,9 +91,14 @@ async def _addresses(process: asyncio.subprocess.Process, log: IO[str]) -> dict[
     assert process.stdout is not None
     try:
         async with asyncio.timeout(_START_TIMEOUT_S):
+            found: dict[str, str] = {}
             async for line in process.stdout:
-                if ready := _READY.search(line.decode("utf-8", "replace")):
-                    return {"grpc": ready[1], "http": ready[2]}
+                text = line.decode("utf-8", "replace")
+                if listening := _LISTENING.search(text):
+                    found = {"grpc": listening[1], "http": listening[2]}
+                # Until then the first lossless frame would wait, and its time would say nothing.
+                if found and text.startswith(_READY):
+                    return found
     except TimeoutError:
         raise CliError(_last_words(f"not ready within {_START_TIMEOUT_S:g} s", log)) from None
     code = await process.wait()

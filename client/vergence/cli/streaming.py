@@ -53,18 +53,24 @@ def every_frame(
 
 
 async def live_frames(
-    session: DepthSession, frames: AsyncIterator[tuple[int, SourceFrame]], *, rate_hz: float
+    session: DepthSession, frames: AsyncIterator[tuple[int, SourceFrame]], *, rate_hz: float | None
 ) -> AsyncGenerator[AnsweredFrame, None]:
-    """Submit frames at a rate, as a camera would; the session counts those that are dropped."""
+    """Submit frames at a rate, as a camera would; the session counts those that are dropped.
+
+    Without a rate, frames are submitted as they come.
+    """
     sent: dict[int, tuple[int, SourceFrame]] = {}
 
     async def film() -> None:
         started_s = time.monotonic()
         try:
             async for index, source in frames:
-                await asyncio.sleep(started_s + index / rate_hz - time.monotonic())
+                if rate_hz is not None:
+                    await asyncio.sleep(started_s + index / rate_hz - time.monotonic())
                 frame = source.frame
-                if frame_id := session.submit(frame.left, frame.right, frame.pose):
+                at_ns = frame.capture_ns if rate_hz is None else None  # None: now
+                frame_id = session.submit(frame.left, frame.right, frame.pose, capture_ns=at_ns)
+                if frame_id is not None:
                     sent[frame_id] = index, source
         finally:
             session.end()  # the reader below ends after the last answer

@@ -35,6 +35,7 @@ files that it reads.
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -70,7 +71,9 @@ from vergence_proto.datasets.images import (
     write_disparity_png,
     write_pfm,
 )
-from vergence_proto.datasets.source import SourceFrame, StereoSource, Truth
+from vergence_proto.datasets.loose import open_image_folder, open_images
+from vergence_proto.datasets.packings import nominal_rig
+from vergence_proto.datasets.source import SourceFrame, StereoSource, Truth, nominal_ns
 
 __all__ = [
     "DATASETS",
@@ -78,9 +81,14 @@ __all__ = [
     "SourceFrame",
     "StereoSource",
     "Truth",
+    "detect_sources",
     "encode_disparity_png",
     "encode_pfm",
     "find_sources",
+    "nominal_ns",
+    "nominal_rig",
+    "open_image_folder",
+    "open_images",
     "open_source",
     "read_ahead",
     "read_disparity_png",
@@ -157,6 +165,27 @@ def find_sources(spec: str) -> list[str]:
     kind, path, _ = _parsed(spec)
     _, question, options = spec.partition("?")
     return [f"{kind}:{each}{question}{options}" for each in DATASETS[kind].find(path)]
+
+
+def detect_sources(folder: Path) -> list[str]:
+    """List every source of any kind in or under ``folder``, as :func:`open_source` takes it.
+
+    Kinds may share a layout: of those that claim one path, the one is listed that finds its truth.
+    """
+    claims: dict[Path, list[str]] = {}
+    for kind, dataset in DATASETS.items():
+        for path in dataset.find(folder):
+            claims.setdefault(path, []).append(f"{kind}:{path}")
+    return [specs[0] if len(specs) == 1 else _best(specs) for specs in claims.values()]
+
+
+def _best(specs: list[str]) -> str:
+    opened: dict[str, StereoSource] = {}
+    for spec in specs:
+        with suppress(DatasetError):
+            opened[spec] = open_source(spec)
+    with_truth = (spec for spec, source in opened.items() if source.has_truth)
+    return next(with_truth, next(iter(opened), specs[0]))
 
 
 def _noted(source: StereoSource) -> StereoSource:

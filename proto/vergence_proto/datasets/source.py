@@ -81,6 +81,11 @@ class StereoSource:
         """True for a pair that is no frame of a sequence."""
         return self.fps is None and len(self) == 1
 
+    @property
+    def has_truth(self) -> bool:
+        """True if the ground truth of any frame is there."""
+        return any(each.read_truth is not None for each in self.files)
+
     def without_truth(self) -> "StereoSource":
         """Return the same frames without their ground truth, which takes time to read."""
         return replace(self, files=[replace(each, read_truth=None) for each in self.files])

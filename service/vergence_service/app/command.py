@@ -55,5 +55,15 @@ def run_server(
 
 def _announce(server: Running) -> None:
     zenoh = f" zenoh={server.zenoh.endpoint}" if server.zenoh else ""
-    sys.stdout.write(f"listening grpc={server.grpc_address} http={server.http_address}{zenoh}\n")
+    _say(f"listening grpc={server.grpc_address} http={server.http_address}{zenoh}")
+    server.loading.add_done_callback(_announce_ready)
+
+
+def _announce_ready(loading: asyncio.Task[None]) -> None:
+    if not loading.cancelled() and loading.exception() is None:
+        _say("ready: every graph is loaded")
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(f"{line}\n")
     sys.stdout.flush()

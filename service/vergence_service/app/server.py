@@ -1,7 +1,6 @@
 """Compose the server from its settings, run it, and drain it at the end."""
 
 import asyncio
-import logging
 import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager, closing
@@ -29,8 +28,6 @@ from vergence_service.transports.http.app import HttpServer
 from vergence_service.transports.open_calls import OpenCalls
 from vergence_service.transports.stream_call import StreamLimits
 from vergence_service.transports.unary import UnaryMethods
-
-log = logging.getLogger(__name__)
 
 _MIB = 1 << 20
 _SWEEP_EVERY_S = 1.0
@@ -186,7 +183,6 @@ async def drain(server: Running, *, within_s: float) -> None:
 async def _load_rest(engine: DepthEngine, start_jobs: Callable[[], None]) -> None:
     await engine.load_rest()
     start_jobs()
-    log.info("every graph is loaded")
 
 
 async def _sweep(streams: StreamTable) -> None:
