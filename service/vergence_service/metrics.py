@@ -41,6 +41,11 @@ class Metrics:
             registry=registry,
         )
         self.streams_open = Gauge("vergence_streams_open", "Open streams", registry=registry)
+        self.streams_predicted = Gauge(
+            "vergence_streams_predicted",
+            "Live streams whose next frame is predicted",
+            registry=registry,
+        )
         self.state_bytes = Gauge(
             "vergence_state_bytes", "Memory reserved for recurrent states", registry=registry
         )

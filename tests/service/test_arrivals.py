@@ -4,9 +4,11 @@ import asyncio
 from collections.abc import Sequence
 
 from tests.service.test_batcher import make_batcher, make_step
+from tests.support.frames import frame_message, make_frame
 from tests.support.models import RecallModel
 from tests.support.polling import PATIENCE_S, turns
-from tests.support.server import ManualClock
+from tests.support.server import ManualClock, raw_stream, running_server
+from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.inference.arrivals import ArrivalPredictor, ExpectedFrame
 from vergence_service.inference.batcher import StepBatcher
 from vergence_service.inference.model import Step, StepResult
@@ -132,3 +134,19 @@ def test_a_cadence_is_learned_and_forgotten() -> None:
     assert predictor.next_expected(2.4) == ExpectedFrame(2.0, 2.65), (
         "a was kept waiting and could not send"
     )
+
+
+async def test_a_stream_that_has_ended_is_forgotten() -> None:
+    async with running_server(RecallModel()) as server:
+
+        def predicted() -> float:
+            [metric] = server.engine.metrics.streams_predicted.collect()
+            return metric.samples[0].value
+
+        for _ in range(3):
+            async with raw_stream(server, every=False) as call:
+                assert (await call.ask(frame_message(make_frame(1)))).HasField("disparity")
+                assert predicted() == 1
+                await call.send(pb.StreamDepthRequest(end=pb.End()))
+                assert await call.receive() is None
+            assert predicted() == 0

@@ -123,6 +123,7 @@ async def not_started() -> AsyncIterator[DepthEngine]:
         detach_grace_s=10,
         clock=clock,
         metrics=metrics,
+        on_closed=lambda _: None,
     )
     async with (
         Threads(lanes=1) as threads,

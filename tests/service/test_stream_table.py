@@ -51,6 +51,8 @@ class StreamTableMachine(RuleBasedStateMachine):
         super().__init__()
         self.clock = ManualClock()
         self.registry = CollectorRegistry()
+        self.opened: list[Stream] = []
+        self.closed: list[Stream] = []
         self.table = StreamTable(
             capacity=CAPACITY,
             per_client=PER_CLIENT,
@@ -60,6 +62,7 @@ class StreamTableMachine(RuleBasedStateMachine):
             detach_grace_s=GRACE_S,
             clock=self.clock,
             metrics=Metrics(self.registry),
+            on_closed=self.closed.append,
         )
         # What the table should hold: per open stream its size, whose it is and since when it is
         # unused; when each expired one expired; and who is attached to what.
@@ -126,6 +129,7 @@ class StreamTableMachine(RuleBasedStateMachine):
         self.expired_s.pop(stream_id, None)
         self.owner[stream_id] = connection
         self.streams[stream_id] = stream
+        self.opened.append(stream)
         return connection
 
     @rule(stream_id=st.sampled_from("abcde"))
@@ -201,6 +205,8 @@ class StreamTableMachine(RuleBasedStateMachine):
         assert self.registry.get_sample_value("vergence_state_bytes") == sum(self.sizes.values())
         for stream_id, stream in self.streams.items():
             assert stream.attachment is self.owner[stream_id]
+        ended = [stream for stream in self.opened if stream not in self.streams.values()]
+        assert sorted(map(id, self.closed)) == sorted(map(id, ended)), "each is reported once"
 
 
 StreamTableMachine.TestCase.settings = settings(

@@ -42,6 +42,9 @@ class RecallModel:
     def warm_up(self, iterations: int, *cold_iterations: int) -> None:
         assert {iterations, *cold_iterations} <= set(self.card.graphs)
 
+    def step_bytes(self, height: int, width: int, iterations: int, *, cold: bool) -> int:
+        return 64 * height * width
+
     def step(self, steps: Sequence[Step]) -> list[StepResult]:
         assert len({(row.iterations, row.cold, row.view.left.shape) for row in steps}) == 1
         self.batches.append(len(steps))

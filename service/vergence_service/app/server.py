@@ -73,6 +73,7 @@ async def running(
     """
     registry = CollectorRegistry()
     metrics = Metrics(registry)
+    batcher = StepBatcher(model, max_batch=settings.model.max_batch, clock=clock, metrics=metrics)
     streams = StreamTable(
         capacity=settings.streams.capacity,
         per_client=settings.limits.streams_per_client,
@@ -82,8 +83,8 @@ async def running(
         detach_grace_s=settings.streams.detach_grace_s,
         clock=clock,
         metrics=metrics,
+        on_closed=lambda stream: batcher.forget(stream.stream_id),
     )
-    batcher = StepBatcher(model, max_batch=settings.model.max_batch, clock=clock, metrics=metrics)
     threads = Threads(lanes=model.max_concurrent_steps)
     engine = DepthEngine(
         streams,

@@ -33,6 +33,9 @@ class ArrivalPredictor:
     def __init__(self) -> None:
         self._cadences: dict[str, _Cadence] = {}
 
+    def __len__(self) -> int:
+        return len(self._cadences)
+
     def arrived(self, stream_id: str, now_s: float) -> None:
         """Record that a frame of the stream arrived."""
         cadence = self._cadences.get(stream_id)
@@ -48,6 +51,10 @@ class ArrivalPredictor:
         """Record that the last frame of the stream was answered."""
         if stream_id in self._cadences:
             self._cadences[stream_id].answered_s = now_s
+
+    def forget(self, stream_id: str) -> None:
+        """Forget a stream, because it is closed."""
+        self._cadences.pop(stream_id, None)
 
     def next_expected(self, now_s: float) -> ExpectedFrame | None:
         """Return the live frame that is expected first, or None if none is expected."""

@@ -24,6 +24,8 @@ log = logging.getLogger(__name__)
 # A step that is not live waits for live steps at most this long. A job then continues, if slowly,
 # beside streams that leave no gap, and one live frame in thirty is late because of it.
 _PATIENCE_S = 2.0
+# Clients choose the sizes of their images, so there is no end of shapes.
+_SHAPES_REMEMBERED = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,6 +78,7 @@ class StepBatcher:
         self._free_lanes = asyncio.Semaphore(lanes)
         self._changed = asyncio.Event()  # set when a step arrives or leaves the model
         self._arrivals = ArrivalPredictor()
+        metrics.streams_predicted.set_function(lambda: len(self._arrivals))
         self._work_s: dict[tuple[object, ...], float] = {}  # last duration per shape of work
 
     async def __aenter__(self) -> Self:
@@ -121,6 +124,10 @@ class StepBatcher:
             self._arrivals.arrived(live_stream, now_s)
         self._changed.set()
         return await answer
+
+    def forget(self, stream_id: str) -> None:
+        """Forget what was learned about a live stream, because it is closed."""
+        self._arrivals.forget(stream_id)
 
     async def _run(self) -> None:
         async with asyncio.TaskGroup() as lanes:
@@ -196,7 +203,7 @@ class StepBatcher:
                 await self._step_together([item])
             return
         model_s = self._clock() - started_s
-        self._work_s[batch[0].shape_of_work] = model_s
+        self._note_duration(batch[0].shape_of_work, model_s)
         self._metrics.batch_size.observe(len(batch))
         for item, result in zip(batch, results, strict=True):
             if item.live_stream is not None:
@@ -205,6 +212,12 @@ class StepBatcher:
                 queue_s = item.timings.queue_s + started_s - item.since_s
                 timings = replace(item.timings, queue_s=queue_s, model_s=model_s)
                 item.answer.set_result((result, timings))
+
+    def _note_duration(self, shape_of_work: tuple[object, ...], model_s: float) -> None:
+        self._work_s.pop(shape_of_work, None)  # the newest is last
+        self._work_s[shape_of_work] = model_s
+        if len(self._work_s) > _SHAPES_REMEMBERED:
+            del self._work_s[next(iter(self._work_s))]
 
 
 def _unanswered(items: Sequence[_Waiting]) -> list[_Waiting]:

@@ -126,6 +126,10 @@ class StereoModel(Protocol):
         """Load whatever the first steps with these iteration counts would wait for."""
         ...
 
+    def step_bytes(self, height: int, width: int, iterations: int, *, cold: bool) -> int:
+        """Return the memory that one step of this image size takes at most while it runs."""
+        ...
+
     def step(self, steps: Sequence[Step]) -> list[StepResult]:
         """Run one step of each stream.
 

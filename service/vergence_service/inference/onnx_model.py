@@ -1,7 +1,6 @@
 """A stereo model that runs as ONNX graphs in onnxruntime."""
 
 import importlib.util
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -27,6 +26,16 @@ from vergence_service.inference.providers import (
     device_of,
     require_provider,
 )
+
+# The memory of a step: pixels * (bytes per pixel + bytes per column * columns), for the graphs of
+# `lite` relate every pixel of a row to every other. Upper bounds, measured on a CPU;
+# tests/service/test_step_memory.py measures again.
+_FROM_NOTHING = (320.0, 0.345)  # the graphs of cold starts
+_ANY_STEP = (110.0, 0.07)
+_SAVING = (70.0, 0.045)  # any step, if it saves memory
+_BESIDE_PIXELS = 12 << 20
+# A step that would need more than this saves memory.
+_LARGE_STEP = 512 << 20
 
 
 class OnnxStereoModel:
@@ -81,6 +90,15 @@ class OnnxStereoModel:
         for count in cold_iterations:
             self._graphs.load(count, cold_pixels=0)
 
+    def step_bytes(self, height: int, width: int, iterations: int, *, cold: bool) -> int:
+        height, width = self._card.step_size(height, width)
+        pixels = height * width
+        own_graphs = iterations in self._card.cold_graphs and pixels <= self._card.cold_max_pixels
+        if cold and own_graphs:
+            return _bytes_of(_FROM_NOTHING, pixels, width)
+        usual = _bytes_of(_ANY_STEP, pixels, width)
+        return usual if usual <= _LARGE_STEP else _bytes_of(_SAVING, pixels, width)
+
     def close(self) -> None:
         """Stop the threads that steps use. No step may follow."""
         self._graphs.close()
@@ -94,8 +112,14 @@ class OnnxStereoModel:
 
     def _step(self, steps: Sequence[Step]) -> list[StepResult]:
         height, width = steps[0].view.left.shape[:2]
-        pixels = math.prod(self._card.step_size(height, width)) if steps[0].cold else None
-        found = self._graphs.run(steps[0].iterations, self._feeds(steps), cold_pixels=pixels)
+        step_height, step_width = self._card.step_size(height, width)
+        pixels = step_height * step_width
+        found = self._graphs.run(
+            steps[0].iterations,
+            self._feeds(steps),
+            cold_pixels=pixels if steps[0].cold else None,
+            save_memory=_bytes_of(_ANY_STEP, pixels, step_width) > _LARGE_STEP,
+        )
         # States on a device are not checked: a bad value would show in the maps of the next step.
         to_check = [values for values in found.values() if not isinstance(values, DeviceTensor)]
         if not all(np.isfinite(values).all() for values in to_check):
@@ -129,6 +153,11 @@ class OnnxStereoModel:
                 else _stack([*map(on_host, before)])
             )
         return feeds
+
+
+def _bytes_of(measured: tuple[float, float], pixels: int, columns: int) -> int:
+    per_pixel, per_column = measured
+    return _BESIDE_PIXELS + int(pixels * (per_pixel + per_column * columns))
 
 
 def on_host(tensor: Tensor) -> NDArray[np.float32]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -74,6 +75,11 @@ def start_session(
 
     Raises ProviderUnavailable if the first provider cannot start.
     """
+    if providers[0] == PROVIDERS["cpu"]:
+        _share_arena()
+        options.add_session_config_entry("session.use_env_allocators", "1")
+        # A pattern is one more buffer, as large as the peak of a step, for each size of image.
+        options.enable_mem_pattern = False
     session = onnxruntime.InferenceSession(graph, options, providers=list(providers))
     # onnxruntime falls back to the CPU with a warning. A server must not do so silently.
     if session.get_providers()[0] != providers[0]:
@@ -82,6 +88,26 @@ def start_session(
             "the reason (usually a missing driver or library)"
         )
     return session
+
+
+@cache
+def _share_arena() -> None:
+    """Make the arena that all sessions on the CPU share, once per process.
+
+    An arena keeps what it has allocated. With one for each graph, a server that had stepped a few
+    image sizes kept three times the memory of its largest step.
+    """
+    where = onnxruntime.OrtMemoryInfo(
+        "Cpu", onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, onnxruntime.OrtMemType.DEFAULT
+    )
+    onnxruntime.create_and_register_allocator(where, None)
+
+
+def returning_memory() -> onnxruntime.RunOptions:
+    """Return the options of a run after which the shared arena returns what it does not use."""
+    options = onnxruntime.RunOptions()
+    options.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")
+    return options
 
 
 def run_on_device(

@@ -26,7 +26,10 @@ _TOMBSTONE_S = 300.0
 
 
 class StreamTable:
-    """All streams of one server, within its limits. ``clock`` returns seconds."""
+    """All streams of one server, within its limits. ``clock`` returns seconds.
+
+    ``on_closed`` is called with every stream that was closed or has expired.
+    """
 
     def __init__(
         self,
@@ -39,6 +42,7 @@ class StreamTable:
         detach_grace_s: float,
         clock: Callable[[], float],
         metrics: Metrics,
+        on_closed: Callable[[Stream], None],
     ) -> None:
         self.capacity = capacity
         self.idle_timeout_s = idle_timeout_s
@@ -48,6 +52,7 @@ class StreamTable:
         self._idle_notice_s = idle_notice_s
         self._clock = clock
         self._metrics = metrics
+        self._on_closed = on_closed
         self._streams: dict[str, Stream] = {}
         self._expired_s: dict[str, float] = {}  # tombstones
 
@@ -181,6 +186,7 @@ class StreamTable:
         if self._streams.get(stream.stream_id) is stream:
             del self._streams[stream.stream_id]
             self._count()
+            self._on_closed(stream)
 
     def sweep(self) -> None:
         """Expire the streams that are due, and warn those that will be soon."""
