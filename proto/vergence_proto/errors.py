@@ -9,6 +9,7 @@
     |-- FrameOutOfOrder, ModelChanged                    the stream's state does not allow it
     |-- StreamLimit, StateMemory, Quota, FrameTooLarge   a limit of the server is exceeded
     |-- FrameStale                                       too late to be useful
+    |-- ClientTimeout                                    the client sends too slowly
     |-- BadSequence, UploadTooLarge                      an uploaded sequence is refused
     |-- UnknownSequence, SequenceNotDone, QueueFull      the job or its result is not available
     |-- Draining, NotReady                               not now: try again, or on another server
@@ -40,6 +41,7 @@ class ErrorCode(StrEnum):
     QUOTA = "QUOTA"
     FRAME_TOO_LARGE = "FRAME_TOO_LARGE"
     FRAME_STALE = "FRAME_STALE"
+    CLIENT_TIMEOUT = "CLIENT_TIMEOUT"
     DRAINING = "DRAINING"
     NOT_READY = "NOT_READY"
     MODEL_FAILED = "MODEL_FAILED"
@@ -155,6 +157,12 @@ class FrameStale(DepthError):
     """The frame waited longer than its maximum age; the stream's state is unchanged."""
 
     code = ErrorCode.FRAME_STALE
+
+
+class ClientTimeout(DepthError):
+    """The client did not send its first message, its headers or its body in time."""
+
+    code = ErrorCode.CLIENT_TIMEOUT
 
 
 class Draining(DepthError):

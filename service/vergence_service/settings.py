@@ -137,6 +137,24 @@ class LimitSettings(_Section):
     max_state_mib: PositiveInt = Field(
         default=512, description="memory for the recurrent states of all streams together"
     )
+    connections: PositiveInt = Field(
+        default=256,
+        description="most connections over gRPC, and over HTTP; fewer if descriptors are scarce",
+    )
+    first_message_s: PositiveFloat = Field(
+        default=10.0,
+        description="time for the first message of a call, or for the headers of a request",
+    )
+    silent_s: PositiveFloat = Field(
+        default=15.0,
+        description="detach a client that pings, and then sends nothing for this long",
+    )
+    write_s: PositiveFloat = Field(
+        default=10.0, description="disconnect a client that does not read an answer for this long"
+    )
+    min_kib_per_s: PositiveFloat = Field(
+        default=16.0, description="slowest upload and download, in KiB per second"
+    )
     streams_per_client: PositiveInt | None = Field(
         default=None, description="most open streams of one address, over gRPC and HTTP"
     )

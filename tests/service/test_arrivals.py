@@ -90,6 +90,19 @@ async def test_a_live_step_takes_the_free_lane_beside_another() -> None:
         await asyncio.gather(urgent, other)
 
 
+async def test_a_closed_stream_is_waited_for_no_longer() -> None:
+    clock = ManualClock()
+    model = TimedModel(clock)
+    async with make_batcher(model, clock=clock) as batcher:
+        await batcher.step(make_step(OTHER))
+        for _ in range(3):
+            await live(batcher)
+            clock.advance(0.1 - STEP_S)
+        batcher.forget("headset")
+        _, timings = await asyncio.wait_for(batcher.step(make_step(OTHER)), PATIENCE_S)
+    assert timings.queue_s == 0
+
+
 async def test_a_step_that_fits_into_the_gap_is_taken_at_once() -> None:
     clock = ManualClock()
     async with make_batcher(TimedModel(clock), clock=clock) as batcher:

@@ -237,7 +237,7 @@ async def test_a_frame_of_another_size_is_refused() -> None:
 async def test_a_closed_stream_is_unknown() -> None:
     async with running_server(RecallModel()) as server:
         await server.engine.open("a", OPENING)
-        server.engine.close("a")
+        await server.engine.close("a")
         with pytest.raises(UnknownStream, match="open it before"):
             await step(server.engine, "a", make_frame(1))
 

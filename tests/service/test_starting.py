@@ -114,6 +114,7 @@ async def test_an_early_client_sees_that_the_server_loads_and_is_served_when_it_
 async def not_started() -> AsyncIterator[DepthEngine]:
     """An engine whose model is not loaded."""
     model, metrics, clock = RecallModel(), Metrics(CollectorRegistry()), ManualClock()
+    batcher = StepBatcher(model, max_batch=1, clock=clock, metrics=metrics)
     streams = StreamTable(
         capacity=1,
         per_client=None,
@@ -121,14 +122,12 @@ async def not_started() -> AsyncIterator[DepthEngine]:
         idle_timeout_s=60,
         idle_notice_s=10,
         detach_grace_s=10,
+        silent_s=15,
         clock=clock,
         metrics=metrics,
         on_closed=lambda _: None,
     )
-    async with (
-        Threads(lanes=1) as threads,
-        StepBatcher(model, max_batch=1, clock=clock, metrics=metrics) as batcher,
-    ):
+    async with Threads(lanes=1) as threads, batcher:
         yield DepthEngine(
             streams,
             batcher,

@@ -25,7 +25,7 @@ from vergence_service.streams.stream import Notice, Stream, StreamConfig
 from vergence_service.streams.table import StreamTable
 
 CAPACITY, PER_CLIENT, MEMORY, STATE = 3, 2, 1000, 400
-IDLE_S, NOTICE_S, GRACE_S, TOMBSTONE_S = 60.0, 10.0, 10.0, 300.0
+IDLE_S, NOTICE_S, GRACE_S, TOMBSTONE_S, SILENT_S = 60.0, 10.0, 10.0, 300.0, 15.0
 RIG_OPENING = StreamConfig(StereoRig.from_rectified(RIG))
 RECTIFIER = Rectifier.of(RIG_OPENING.rig, REACH)
 
@@ -33,9 +33,24 @@ RECTIFIER = Rectifier.of(RIG_OPENING.rig, REACH)
 class Connection:
     """An attachment that records its notices and its end."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: ManualClock) -> None:
         self.notices: list[Notice] = []
         self.errors: list[DepthError] = []
+        self.losses: list[str] = []
+        self.busy = False
+        self.heard_s = clock.now_s
+        self.stream: Stream | None = None
+        self._clock = clock
+
+    @property
+    def silent_s(self) -> float:
+        return 0.0 if self.busy else self._clock.now_s - self.heard_s
+
+    def lose(self, why: str) -> None:
+        self.losses.append(why)
+
+    async def ended(self) -> None:
+        raise NotImplementedError
 
     def notify(self, notice: Notice) -> None:
         self.notices.append(notice)
@@ -60,6 +75,7 @@ class StreamTableMachine(RuleBasedStateMachine):
             idle_timeout_s=IDLE_S,
             idle_notice_s=NOTICE_S,
             detach_grace_s=GRACE_S,
+            silent_s=SILENT_S,
             clock=self.clock,
             metrics=Metrics(self.registry),
             on_closed=self.closed.append,
@@ -72,16 +88,26 @@ class StreamTableMachine(RuleBasedStateMachine):
         self.expired_s: dict[str, float] = {}
         self.owner: dict[str, Connection | None] = {}
         self.streams: dict[str, Stream] = {}
+        # Connections without a stream that have not ended, and whose they are.
+        self.leaving: dict[Connection, str] = {}
+        self.silent: set[Connection] = set()
 
     def settle(self) -> None:
         """Expire in the model what is due by now."""
         for stream_id in list(self.sizes):
-            patience_s = IDLE_S if self.owner[stream_id] else GRACE_S
+            owner = self.owner[stream_id]
+            if owner is not None and owner.busy:
+                self.used_s[stream_id] = self.clock.now_s
+            patience_s = IDLE_S if owner else GRACE_S
             if self.clock.now_s >= self.used_s[stream_id] + patience_s:
                 self.forget(stream_id)
                 self.expired_s[stream_id] = self.clock.now_s
+            elif owner is not None and owner.silent_s >= SILENT_S:
+                self.silent.add(owner)
 
     def forget(self, stream_id: str) -> None:
+        if (owner := self.owner[stream_id]) is not None:
+            self.leaving[owner] = self.clients[stream_id]
         for table in (self.sizes, self.clients, self.used_s, self.owner, self.streams):
             table.pop(stream_id)
 
@@ -106,13 +132,13 @@ class StreamTableMachine(RuleBasedStateMachine):
     def open(self, stream_id: str, size: int, client: str) -> Connection:
         self.table.sweep()
         self.settle()
-        connection = Connection()
+        connection = Connection(self.clock)
         expected: type[DepthError] | None = None
         if stream_id in self.sizes:
             expected = StreamExists
-        elif client and list(self.clients.values()).count(client) == PER_CLIENT:
+        elif client and self.count(client) >= PER_CLIENT:
             expected = Quota
-        elif len(self.sizes) == CAPACITY:
+        elif len(self.sizes) + len(self.leaving) >= CAPACITY:
             expected = StreamLimit
         elif sum(self.sizes.values()) + size > MEMORY:
             expected = StateMemory
@@ -128,9 +154,12 @@ class StreamTableMachine(RuleBasedStateMachine):
         self.used_s[stream_id] = self.clock.now_s
         self.expired_s.pop(stream_id, None)
         self.owner[stream_id] = connection
-        self.streams[stream_id] = stream
+        self.streams[stream_id] = connection.stream = stream
         self.opened.append(stream)
         return connection
+
+    def count(self, client: str) -> int:
+        return [*self.clients.values(), *self.leaving.values()].count(client)
 
     @rule(stream_id=st.sampled_from("abcde"))
     def use(self, stream_id: str) -> None:
@@ -149,8 +178,10 @@ class StreamTableMachine(RuleBasedStateMachine):
     @rule(connection=connections)
     def lose_connection(self, connection: Connection) -> None:
         self.settle()
-        for stream_id, stream in self.streams.items():
-            self.table.detach(stream, connection)
+        if connection.stream is not None:
+            self.table.detach(connection.stream, connection)
+        self.leaving.pop(connection, None)
+        for stream_id in self.streams:
             if self.owner[stream_id] is connection:
                 self.owner[stream_id] = None
                 self.used_s[stream_id] = self.clock.now_s
@@ -163,7 +194,7 @@ class StreamTableMachine(RuleBasedStateMachine):
     )
     def resume(self, stream_id: str, right_token: bool, client: str) -> Connection:
         self.settle()
-        connection = Connection()
+        connection = Connection(self.clock)
         if stream_id not in self.sizes:
             with pytest.raises((StreamExpired, UnknownStream)):
                 self.attach(stream_id, b"any", client, connection)
@@ -175,9 +206,11 @@ class StreamTableMachine(RuleBasedStateMachine):
             assert stream.attachment is before
             return connection
         self.attach(stream_id, stream.resume_token, client, connection)
-        self.clients[stream_id] = client
+        connection.stream = stream
         if before is not None:
+            self.leaving[before] = self.clients[stream_id]
             assert isinstance(before.errors[-1], Superseded)
+        self.clients[stream_id] = client
         self.owner[stream_id] = connection
         self.used_s[stream_id] = self.clock.now_s
         return connection
@@ -192,6 +225,10 @@ class StreamTableMachine(RuleBasedStateMachine):
             self.table.close(self.streams[stream_id])
             self.forget(stream_id)
 
+    @rule(connection=connections, busy=st.booleans())
+    def hear_from(self, connection: Connection, busy: bool) -> None:
+        connection.busy, connection.heard_s = busy, self.clock.now_s
+
     @rule(seconds=st.sampled_from([1.0, 9.0, 11.0, 51.0, 61.0, 301.0]))
     def wait(self, seconds: float) -> None:
         self.clock.advance(seconds)
@@ -204,7 +241,11 @@ class StreamTableMachine(RuleBasedStateMachine):
         assert self.registry.get_sample_value("vergence_streams_open") == len(self.sizes)
         assert self.registry.get_sample_value("vergence_state_bytes") == sum(self.sizes.values())
         for stream_id, stream in self.streams.items():
-            assert stream.attachment is self.owner[stream_id]
+            owner = self.owner[stream_id]
+            assert stream.attachment is owner
+            if owner is not None:
+                assert bool(owner.losses) == (owner in self.silent)
+                assert not owner.busy or self.table.idle_s(stream) == 0
         ended = [stream for stream in self.opened if stream not in self.streams.values()]
         assert sorted(map(id, self.closed)) == sorted(map(id, ended)), "each is reported once"
 

@@ -162,7 +162,7 @@ class OpenStream(_message.Message):
     def __init__(self, stream_id: _Optional[str] = ..., resume_token: _Optional[bytes] = ..., rig: _Optional[_Union[StereoRig, _Mapping[str, _Any]]] = ..., axes: _Optional[_Union[Axes, str]] = ..., delivery: _Optional[_Union[Delivery, str]] = ..., output: _Optional[_Union[OutputFormat, _Mapping[str, _Any]]] = ..., iterations: _Optional[int] = ..., cold_iterations: _Optional[int] = ..., weights_sha256: _Optional[str] = ...) -> None: ...
 
 class StreamOpened(_message.Message):
-    __slots__ = ("stream_id", "resume_token", "credit", "rig", "model", "resumed", "detach_grace_s", "idle_timeout_s", "last_frame_id")
+    __slots__ = ("stream_id", "resume_token", "credit", "rig", "model", "resumed", "detach_grace_s", "idle_timeout_s", "last_frame_id", "silent_s")
     STREAM_ID_FIELD_NUMBER: _ClassVar[int]
     RESUME_TOKEN_FIELD_NUMBER: _ClassVar[int]
     CREDIT_FIELD_NUMBER: _ClassVar[int]
@@ -172,6 +172,7 @@ class StreamOpened(_message.Message):
     DETACH_GRACE_S_FIELD_NUMBER: _ClassVar[int]
     IDLE_TIMEOUT_S_FIELD_NUMBER: _ClassVar[int]
     LAST_FRAME_ID_FIELD_NUMBER: _ClassVar[int]
+    SILENT_S_FIELD_NUMBER: _ClassVar[int]
     stream_id: str
     resume_token: bytes
     credit: int
@@ -181,7 +182,8 @@ class StreamOpened(_message.Message):
     detach_grace_s: float
     idle_timeout_s: float
     last_frame_id: int
-    def __init__(self, stream_id: _Optional[str] = ..., resume_token: _Optional[bytes] = ..., credit: _Optional[int] = ..., rig: _Optional[_Union[RectifiedRig, _Mapping[str, _Any]]] = ..., model: _Optional[_Union[ModelInfo, _Mapping[str, _Any]]] = ..., resumed: bool = ..., detach_grace_s: _Optional[float] = ..., idle_timeout_s: _Optional[float] = ..., last_frame_id: _Optional[int] = ...) -> None: ...
+    silent_s: float
+    def __init__(self, stream_id: _Optional[str] = ..., resume_token: _Optional[bytes] = ..., credit: _Optional[int] = ..., rig: _Optional[_Union[RectifiedRig, _Mapping[str, _Any]]] = ..., model: _Optional[_Union[ModelInfo, _Mapping[str, _Any]]] = ..., resumed: bool = ..., detach_grace_s: _Optional[float] = ..., idle_timeout_s: _Optional[float] = ..., last_frame_id: _Optional[int] = ..., silent_s: _Optional[float] = ...) -> None: ...
 
 class Frame(_message.Message):
     __slots__ = ("frame_id", "capture_ns", "left", "right", "pose", "max_age_s")

@@ -9,6 +9,7 @@ from typing import Any
 
 from vergence_proto.model_io import ManifestError
 from vergence_service.app.server import Running, serve
+from vergence_service.descriptors import raise_descriptor_limit
 from vergence_service.inference.providers import ProviderUnavailable
 from vergence_service.malloc import keep_freed_memory
 from vergence_service.settings import SettingsError, load_settings
@@ -47,6 +48,7 @@ def run_server(
         )
         logging.getLogger("uvicorn.error").setLevel(logging.WARNING)  # says "started" too early
         keep_freed_memory()
+        raise_descriptor_limit()
         asyncio.run(serve(settings, on_serving=_announce, until_eof=until_eof))
     except _OPERATOR_ERRORS as error:
         sys.stderr.write(f"vergence serve: {error}\n")

@@ -19,6 +19,7 @@ from vergence_service.settings import Settings
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.transports.addresses import listening_socket
 from vergence_service.transports.http.app import HttpServer, make_http_app
+from vergence_service.transports.http.connections import ConnectionLimits
 from vergence_service.transports.http.pairs import pair_routes
 from vergence_service.transports.http.sequences import no_sequence_routes, sequence_routes
 from vergence_service.transports.http.streams import stream_routes
@@ -47,6 +48,8 @@ async def serving_http(
     unary: UnaryMethods,
     calls: OpenCalls,
     registry: CollectorRegistry,
+    *,
+    connections: int,
 ) -> AsyncIterator[HttpTransport]:
     """Serve HTTP until the end of the block.
 
@@ -58,12 +61,17 @@ async def serving_http(
         max_unpacked_bytes=batch.max_unpacked_mib * _MIB,
         max_ratio=batch.max_ratio,
     )
+    min_bytes_per_s = settings.limits.min_kib_per_s * 1024
     upload = UploadLimits(
-        max_bytes=batch.max_upload_mib * _MIB, idle_s=batch.idle_s, archive=archive
+        max_bytes=batch.max_upload_mib * _MIB,
+        idle_s=batch.idle_s,
+        min_bytes_per_s=min_bytes_per_s,
+        archive=archive,
     )
     pair = UploadLimits(
         max_bytes=2 * settings.limits.max_frame_mib * _MIB,
         idle_s=batch.idle_s,
+        min_bytes_per_s=min_bytes_per_s,
         archive=replace(archive, max_files=2),
     )
     stopping = asyncio.Event()
@@ -72,7 +80,15 @@ async def serving_http(
         listening = stack.enter_context(
             listening_socket(host, settings.http.port, transport="http")
         )
-        routes = [pair_routes(engine, limits=pair), stream_routes(calls, unary)]
+        routes = [
+            pair_routes(engine, limits=pair),
+            stream_routes(
+                calls,
+                unary,
+                patience_s=settings.limits.first_message_s,
+                min_bytes_per_s=min_bytes_per_s,
+            ),
+        ]
         start: Callable[[], None]
         try:
             store = stack.enter_context(_job_store(settings))
@@ -106,7 +122,18 @@ async def serving_http(
             routes=routes,
         )
         server = await stack.enter_async_context(
-            HttpServer(app, calls, listening=listening, stopping=stopping)
+            HttpServer(
+                app,
+                calls,
+                listening=listening,
+                limits=ConnectionLimits(
+                    connections=connections,
+                    headers_s=settings.limits.first_message_s,
+                    write_s=settings.limits.write_s,
+                    min_bytes_per_s=min_bytes_per_s,
+                ),
+                stopping=stopping,
+            )
         )
         yield HttpTransport(server, start)
 

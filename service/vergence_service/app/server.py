@@ -13,6 +13,7 @@ from vergence_proto.stopping import STOP_SIGNALS, on_end_of_input, on_signals
 from vergence_proto.types import Delivery
 from vergence_service.app.http import serving_http
 from vergence_service.app.zenoh import ZenohTransport, serving_zenoh
+from vergence_service.descriptors import affordable_connections
 from vergence_service.inference.batcher import StepBatcher
 from vergence_service.inference.model import StereoModel
 from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
@@ -81,6 +82,7 @@ async def running(
         idle_timeout_s=settings.streams.idle_timeout_s,
         idle_notice_s=settings.streams.idle_notice_s,
         detach_grace_s=settings.streams.detach_grace_s,
+        silent_s=settings.limits.silent_s,
         clock=clock,
         metrics=metrics,
         on_closed=lambda stream: batcher.forget(stream.stream_id),
@@ -107,6 +109,8 @@ async def running(
         credit=settings.streams.credit,
         waiting_frames=settings.streams.waiting_frames,
         max_frame_bytes=max_frame_bytes,
+        silent_s=settings.limits.silent_s,
+        write_s=settings.limits.write_s,
     )
     unary = UnaryMethods(
         engine,
@@ -114,6 +118,8 @@ async def running(
         provider=model.provider,
         max_frame_bytes=max_frame_bytes,
     )
+
+    connections = affordable_connections(settings.limits.connections)
 
     def open_calls() -> OpenCalls:
         return OpenCalls(engine, limits=limits, clock=clock)
@@ -129,8 +135,12 @@ async def running(
             host=grpc_host,
             port=settings.grpc.port,
             max_frame_bytes=max_frame_bytes,
+            max_connections=connections,
+            first_message_s=settings.limits.first_message_s,
         ) as grpc_server,
-        serving_http(settings, http_host, engine, unary, open_calls(), registry) as http,
+        serving_http(
+            settings, http_host, engine, unary, open_calls(), registry, connections=connections
+        ) as http,
         serving_zenoh(settings, unary, open_calls()) as zenoh,
         _in_background(_sweep(streams)),
     ):

@@ -37,6 +37,8 @@ from vergence_service.threads import ThreadPool, Threads
 # A client that comes while the model loads waits for at most this long. It is below the time that
 # the SDK waits for a stream to open, 5 s.
 _LOADING_PATIENCE_S = 3.0
+# A client that does not read keeps its connection for longer than this.
+_CLOSE_S = 1.0
 
 
 class _Phase(Enum):
@@ -181,9 +183,12 @@ class DepthEngine:
         """
         stream = self.streams.get(stream_id)
         self.streams.touch(stream)
-        return await self._step(
-            stream, decode, self.threads.live, arrived_s=arrived_s, max_age_s=max_age_s
-        )
+        try:
+            return await self._step(
+                stream, decode, self.threads.live, arrived_s=arrived_s, max_age_s=max_age_s
+            )
+        finally:
+            self.streams.touch(stream)  # a step may take longer than the idle timeout
 
     async def check_offline(self, rig: StereoRig) -> None:
         """Refuse what :meth:`open_offline` would refuse, with the same errors."""
@@ -240,8 +245,10 @@ class DepthEngine:
         stream.frames_skipped += 1
         self.metrics.frames_failed.labels(error.code).inc()
 
-    def close(self, stream_id: str) -> None:
+    async def close(self, stream_id: str) -> None:
         """End a stream and free its state; any connection may ask for it.
+
+        Returns when the stream's own connection has ended too, but after at most a second.
 
         Raises UnknownStream, StreamExpired.
         """
@@ -249,6 +256,8 @@ class DepthEngine:
         self.streams.close(stream)
         if stream.attachment is not None:
             stream.attachment.end(UnknownStream(f"stream {stream_id!r} was closed"))
+            with suppress(TimeoutError):
+                await asyncio.wait_for(stream.attachment.ended(), _CLOSE_S)
 
     def _check_serving(self) -> None:
         match self._phase:

@@ -30,12 +30,33 @@ class Notice:
 class Attachment(Protocol):
     """The connection that uses a stream. Its methods must neither block nor raise."""
 
+    @property
+    def busy(self) -> bool:
+        """True while a frame of the client waits or is stepped."""
+        ...
+
+    @property
+    def silent_s(self) -> float:
+        """The time since the client last sent anything.
+
+        0 while it waits for an answer, and if it never pings: then silence says nothing.
+        """
+        ...
+
     def notify(self, notice: Notice) -> None:
         """Send the notice to the client."""
         ...
 
     def end(self, error: DepthError) -> None:
         """End the connection with ``error``: the stream does not belong to it any more."""
+        ...
+
+    def lose(self, why: str) -> None:
+        """End the connection as if it were lost: the client may resume the stream on another."""
+        ...
+
+    async def ended(self) -> None:
+        """Wait until the connection has ended."""
         ...
 
 

@@ -40,6 +40,7 @@ class StreamTable:
         idle_timeout_s: float,
         idle_notice_s: float,
         detach_grace_s: float,
+        silent_s: float,
         clock: Callable[[], float],
         metrics: Metrics,
         on_closed: Callable[[Stream], None],
@@ -50,11 +51,15 @@ class StreamTable:
         self._per_client = per_client
         self._max_state_bytes = max_state_bytes
         self._idle_notice_s = idle_notice_s
+        self._silent_s = silent_s
         self._clock = clock
         self._metrics = metrics
         self._on_closed = on_closed
         self._streams: dict[str, Stream] = {}
         self._expired_s: dict[str, float] = {}  # tombstones
+        # Connections that have lost their stream and must end, and the client of each. They count
+        # towards the limits until they have ended.
+        self._leaving: dict[Attachment, str] = {}
 
     def __len__(self) -> int:
         return len(self._streams)
@@ -86,13 +91,14 @@ class StreamTable:
                 "another id"
             )
         theirs = [each for each in self._streams.values() if client and each.client == client]
-        if self._per_client is not None and len(theirs) >= self._per_client:
+        count = len(theirs) + (list(self._leaving.values()).count(client) if client else 0)
+        if self._per_client is not None and count >= self._per_client:
             raise Quota(
-                f"{client} has {len(theirs)} open streams, the limit per client; close one, or "
+                f"{client} has {count} open streams, the limit per client; close one, or "
                 "try again later",
                 retry_after_s=self._next_expiry_s(theirs),
             )
-        if len(self._streams) >= self.capacity:
+        if len(self._streams) + len(self._leaving) >= self.capacity:
             raise StreamLimit(
                 f"the server has {self.capacity} open streams, its limit; close one, or "
                 "try again later",
@@ -142,6 +148,7 @@ class StreamTable:
                 f"stream {stream_id!r} was opened with another rig; open a new stream for this one"
             )
         if stream.attachment is not None:
+            self._leaving[stream.attachment] = stream.client
             stream.attachment.end(
                 Superseded(f"a newer connection attached to stream {stream_id!r}")
             )
@@ -154,7 +161,8 @@ class StreamTable:
         return stream
 
     def detach(self, stream: Stream, attachment: Attachment) -> None:
-        """Detach a connection that is gone; its stream waits for the next connection."""
+        """Detach a connection that has ended; its stream waits for the next connection."""
+        self._leaving.pop(attachment, None)
         if stream.attachment is attachment:
             stream.attachment = None
             self.touch(stream)
@@ -182,30 +190,42 @@ class StreamTable:
         stream.warned = False
 
     def close(self, stream: Stream) -> None:
-        """End a stream and free its state."""
+        """End a stream, and free its state and what was learnt about it."""
         if self._streams.get(stream.stream_id) is stream:
             del self._streams[stream.stream_id]
+            if stream.attachment is not None:
+                self._leaving[stream.attachment] = stream.client
             self._count()
             self._on_closed(stream)
 
     def sweep(self) -> None:
-        """Expire the streams that are due, and warn those that will be soon."""
+        """Expire the streams that are due, warn those that will be soon, and lose silent clients.
+
+        A stream whose frame waits or is stepped is in use.
+        """
         now_s = self._clock()
         for stream in list(self._streams.values()):
+            if _in_use(stream):
+                self.touch(stream)
+            attachment = stream.attachment
             left_s = self._expiry_s(stream) - now_s
             if left_s <= 0:
                 self._expire(stream)
-            elif stream.attachment and left_s <= self._idle_notice_s and not stream.warned:
+            elif attachment is not None and attachment.silent_s >= self._silent_s:
+                attachment.lose(
+                    f"the client sent nothing for {self._silent_s:g} s, not even a ping"
+                )
+            elif attachment is not None and left_s <= self._idle_notice_s and not stream.warned:
                 stream.warned = True
                 message = f"no frame for {now_s - stream.active_s:.0f} s: the stream will expire"
-                stream.attachment.notify(Notice(NoticeKind.EXPIRING, message, left_s))
+                attachment.notify(Notice(NoticeKind.EXPIRING, message, left_s))
         for stream_id, expired_s in list(self._expired_s.items()):
             if now_s - expired_s > _TOMBSTONE_S:
                 del self._expired_s[stream_id]
 
     def idle_s(self, stream: Stream) -> float:
         """Return the time since the stream was last in use."""
-        return self._clock() - stream.active_s
+        return 0.0 if _in_use(stream) else self._clock() - stream.active_s
 
     def _expire(self, stream: Stream) -> None:
         self.close(stream)
@@ -220,10 +240,11 @@ class StreamTable:
 
     def _expiry_s(self, stream: Stream) -> float:
         patience_s = self.idle_timeout_s if stream.attachment else self.detach_grace_s
-        return stream.active_s + patience_s
+        return (self._clock() if _in_use(stream) else stream.active_s) + patience_s
 
     def _next_expiry_s(self, streams: Iterable[Stream]) -> float:
-        return min(map(self._expiry_s, streams), default=0.0) - self._clock()
+        # Without a stream, only connections that are about to end are in the way.
+        return min(map(self._expiry_s, streams), default=self._clock() + 1.0) - self._clock()
 
     def _reserved_bytes(self) -> int:
         return sum(stream.state_bytes for stream in self._streams.values())
@@ -231,6 +252,11 @@ class StreamTable:
     def _count(self) -> None:
         self._metrics.streams_open.set(len(self._streams))
         self._metrics.state_bytes.set(self._reserved_bytes())
+
+
+def _in_use(stream: Stream) -> bool:
+    """Tell whether a frame of the stream waits or is stepped."""
+    return stream.turn.locked() or (stream.attachment is not None and stream.attachment.busy)
 
 
 def _same_rig(one: StereoRig, other: StereoRig) -> bool:

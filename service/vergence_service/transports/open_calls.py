@@ -40,7 +40,7 @@ class OpenCalls:
         )
 
     async def run(self, call: DepthCall) -> None:
-        """Serve the call to its end. Raises the DepthError that it ends with, if any."""
+        """Serve the call to its end. Raises the DepthError that it ends with, or ClientLost."""
         self._running.add(call)
         self._idle.clear()
         try:

@@ -14,6 +14,9 @@ from vergence_service.transports.mailbox import Mailbox, QueuedFrame
 from vergence_service.transports.outbox import Outbox
 from vergence_service.transports.unary import model_info
 
+# A large answer may take longer than ``write_s`` over a slow link.
+_SLOWEST_READER_BYTES_S = 64 << 10
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamLimits:
@@ -22,6 +25,12 @@ class StreamLimits:
     credit: int  # most frames that a client may send before an answer returns
     waiting_frames: int  # frames of a lossless stream that wait before the sender must wait
     max_frame_bytes: int
+    silent_s: float  # a client that pinged and sends nothing for this long counts as lost
+    write_s: float  # so does a client that does not read an answer for this long
+
+
+class ClientLost(Exception):
+    """The client is silent or does not read. It may not see how its call ends, and may resume."""
 
 
 class DepthCall:
@@ -44,13 +53,33 @@ class DepthCall:
         self._limits = limits
         self._clock = clock
         self._outbox = Outbox(
-            write, clock=clock, metrics=engine.metrics, threads=engine.threads.live
+            self._write_in_time, clock=clock, metrics=engine.metrics, threads=engine.threads.live
         )
         self._reader: asyncio.Task[None] | None = None
         self._stepper: asyncio.Task[None] | None = None
         self._stream: Stream | None = None
         self._error: DepthError | None = None  # the error that the call ends with
         self._client_is_done = False
+        self._pings = False  # the client has pinged, so its silence says that it is lost
+        self._owed = 0  # frames that have no answer yet
+        self._heard_s = clock()  # time of the last message, or of the answer that it waited for
+        self._lost: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        self._detached = asyncio.Event()
+
+    @property
+    def busy(self) -> bool:
+        return self._owed > 0
+
+    @property
+    def silent_s(self) -> float:
+        return self._clock() - self._heard_s if self._pings and not self.busy else 0.0
+
+    def lose(self, why: str) -> None:
+        if not self._lost.done():
+            self._lost.set_result(why)
+
+    async def ended(self) -> None:
+        await self._detached.wait()
 
     def notify(self, notice: Notice) -> None:
         self._outbox.put_notice(notice)
@@ -73,28 +102,49 @@ class DepthCall:
             self._reader.cancel()
 
     async def run(self) -> None:
-        """Serve the call to its end. Raises the DepthError that it ends with, if any."""
+        """Serve the call to its end. Raises the DepthError that it ends with, or ClientLost."""
         stream, resumed = await self._open()
         self._stream = stream
         try:
-            await self._write(pb.StreamDepthResponse(opened=self._opened(stream, resumed)))
+            await self._write_in_time(pb.StreamDepthResponse(opened=self._opened(stream, resumed)))
             if self._error is None:
                 await self._serve(stream)
         finally:
             self._engine.streams.detach(stream, self)
+            self._detached.set()
         if self._error is not None:
             raise self._error
         if self._client_is_done:
-            self._engine.close(stream.stream_id)
+            await self._engine.close(stream.stream_id)
 
     async def _serve(self, stream: Stream) -> None:
         mailbox = Mailbox(stream.config.delivery, capacity=self._limits.waiting_frames)
-        async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(self._outbox.send())
-            self._reader = tasks.create_task(self._read(stream, mailbox))
-            self._stepper = tasks.create_task(self._step(stream, mailbox))
-            await asyncio.wait([self._reader, self._stepper])
-            await self._outbox.finish()
+        lost: ClientLost | None = None
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                watching = tasks.create_task(self._raise_if_lost())
+                sending = tasks.create_task(self._outbox.send())
+                self._reader = tasks.create_task(self._read(stream, mailbox))
+                self._stepper = tasks.create_task(self._step(stream, mailbox))
+                await asyncio.wait([self._reader, self._stepper])
+                await self._outbox.finish()
+                await sending
+                watching.cancel()
+        except* ClientLost as group:
+            lost = ClientLost(*group.exceptions[0].args)
+        if lost is not None:
+            raise lost
+
+    async def _raise_if_lost(self) -> None:
+        raise ClientLost(await self._lost)
+
+    async def _write_in_time(self, response: pb.StreamDepthResponse) -> None:
+        patience_s = self._limits.write_s + response.ByteSize() / _SLOWEST_READER_BYTES_S
+        try:
+            async with asyncio.timeout(patience_s):
+                await self._write(response)
+        except TimeoutError:
+            raise ClientLost(f"the client did not read an answer for {patience_s:.0f} s") from None
 
     async def _open(self) -> tuple[Stream, bool]:
         first = await anext(aiter(self._requests), None)
@@ -135,16 +185,18 @@ class DepthCall:
             detach_grace_s=self._engine.streams.detach_grace_s,
             idle_timeout_s=self._engine.streams.idle_timeout_s,
             last_frame_id=stream.last_frame_id,
+            silent_s=self._limits.silent_s,
         )
 
     async def _read(self, stream: Stream, mailbox: Mailbox) -> None:
         try:
             async for request in self._requests:
-                arrived_s = self._clock()
+                arrived_s = self._heard_s = self._clock()
                 match request.WhichOneof("message"):
                     case "frame":
                         await self._receive(stream, mailbox, request.frame, arrived_s)
                     case "ping":
+                        self._pings = True
                         await self._outbox.put_pong(request.ping, arrived_s=arrived_s)
                     case "reset":
                         mailbox.reset()
@@ -163,6 +215,7 @@ class DepthCall:
     async def _receive(
         self, stream: Stream, mailbox: Mailbox, frame: pb.Frame, arrived_s: float
     ) -> None:
+        self._owed += 1
         try:
             displaced = await mailbox.put(QueuedFrame(frame, arrived_s))
         except DepthError as error:
@@ -171,6 +224,7 @@ class DepthCall:
             return
         if displaced is not None:
             await self._drop(stream, [displaced.frame_id])
+            self._answered()
 
     async def _drop(self, stream: Stream, frame_ids: Sequence[int]) -> None:
         for _ in frame_ids:
@@ -205,7 +259,14 @@ class DepthCall:
                 await self._refuse(queued.frame_id, error)
             else:
                 await self._outbox.put_map(stepped)
+                self._answered()
 
     async def _refuse(self, frame_id: int, error: DepthError) -> None:
         message = codec.error_to_frame_error(frame_id, error)
         await self._outbox.put(pb.StreamDepthResponse(frame_error=message))
+        self._answered()
+
+    def _answered(self) -> None:
+        """Count the answer of a frame. The client's time to say something starts again."""
+        self._owed -= 1
+        self._heard_s = self._clock()

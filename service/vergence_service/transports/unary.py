@@ -53,7 +53,7 @@ class UnaryMethods:
         return pb.ResetStreamResponse()
 
     async def close(self, request: pb.CloseStreamRequest) -> pb.CloseStreamResponse:
-        self._engine.close(request.stream_id)
+        await self._engine.close(request.stream_id)
         return pb.CloseStreamResponse()
 
 

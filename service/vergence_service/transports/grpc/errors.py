@@ -32,6 +32,7 @@ GRPC_STATUS: Mapping[ErrorCode, grpc.StatusCode] = {
     ErrorCode.QUOTA: grpc.StatusCode.RESOURCE_EXHAUSTED,
     ErrorCode.FRAME_TOO_LARGE: grpc.StatusCode.RESOURCE_EXHAUSTED,
     ErrorCode.FRAME_STALE: grpc.StatusCode.DEADLINE_EXCEEDED,
+    ErrorCode.CLIENT_TIMEOUT: grpc.StatusCode.DEADLINE_EXCEEDED,
     ErrorCode.DRAINING: grpc.StatusCode.UNAVAILABLE,
     ErrorCode.NOT_READY: grpc.StatusCode.UNAVAILABLE,
     ErrorCode.MODEL_FAILED: grpc.StatusCode.INTERNAL,

@@ -1,5 +1,7 @@
 """vergence.v1.DepthService over grpc.aio, with the standard health and reflection services."""
 
+import logging
+from collections import Counter
 from collections.abc import AsyncIterator
 from typing import Self
 from urllib.parse import unquote
@@ -14,20 +16,32 @@ from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.v1 import depth_pb2_grpc
 from vergence_service.transports.addresses import format_address, listening_socket
 from vergence_service.transports.errors import PortTaken
+from vergence_service.transports.grpc.deadlines import FirstMessageDeadline
 from vergence_service.transports.grpc.errors import Context, errors_as_status
+from vergence_service.transports.grpc.hang_up import hang_up
 from vergence_service.transports.open_calls import OpenCalls
+from vergence_service.transports.stream_call import ClientLost
 from vergence_service.transports.unary import UnaryMethods
+
+log = logging.getLogger(__name__)
 
 _SERVICE = pb.DESCRIPTOR.services_by_name["DepthService"].full_name
 
 # A frame just above the limit is still received, so that the error can name the limit.
 _ROOM_OVER_THE_LIMIT = 1.25
 
+# Calls are limited too: a connection has at most so many, and the server so many more than
+# connections.
+_CALLS_OF_A_CONNECTION = 64
+_MORE_CALLS = 64
+
 # A client that vanished is noticed within 15 s instead of gRPC's two hours. Clients may ping every
-# 5 s.
+# 5 s. A connection without calls is closed after a minute.
 _KEEPALIVE = (
     ("grpc.keepalive_time_ms", 10_000),
     ("grpc.keepalive_timeout_ms", 5_000),
+    ("grpc.http2.ping_timeout_ms", 5_000),  # a minute by default, whatever keepalive_timeout_ms is
+    ("grpc.max_connection_idle_ms", 60_000),
     ("grpc.keepalive_permit_without_calls", 1),
     ("grpc.http2.min_recv_ping_interval_without_data_ms", 4_000),
 )
@@ -55,14 +69,25 @@ class DepthServicer(depth_pb2_grpc.DepthServiceServicer):
     def __init__(self, unary: UnaryMethods, calls: OpenCalls) -> None:
         self._unary = unary
         self.calls = calls
+        self._by_peer: Counter[str] = Counter()  # open calls of each connection
 
     async def StreamDepth(  # noqa: N802 -- the wire's name
         self, request_iterator: AsyncIterator[pb.StreamDepthRequest], context: Context
     ) -> None:
         async with errors_as_status(context):
             requests = _messages(request_iterator)
-            client = _host_of(context.peer())
-            await self.calls.run(self.calls.make(requests, context.write, client=client))
+            peer = context.peer()
+            call = self.calls.make(requests, context.write, client=_host_of(peer))
+            self._by_peer[peer] += 1
+            try:
+                await self.calls.run(call)
+            except ClientLost as lost:
+                log.info("a call over gRPC counts as lost: %s", lost)
+                await hang_up(context, str(lost), shared=self._by_peer[peer] > 1)
+            finally:
+                self._by_peer[peer] -= 1
+                if not self._by_peer[peer]:
+                    del self._by_peer[peer]
 
     async def GetServerInfo(  # noqa: N802
         self, request: pb.GetServerInfoRequest, context: Context
@@ -96,23 +121,37 @@ class GrpcServer:
     """
 
     def __init__(
-        self, servicer: DepthServicer, *, host: str, port: int, max_frame_bytes: int
+        self,
+        servicer: DepthServicer,
+        *,
+        host: str,
+        port: int,
+        max_frame_bytes: int,
+        max_connections: int,
+        first_message_s: float,
     ) -> None:
         self._servicer = servicer
         self._host = host
+        self._max_connections = max_connections
+        self._first_message_s = first_message_s
         self._max_message_bytes = int(max_frame_bytes * _ROOM_OVER_THE_LIMIT)
         self._health = health.aio.HealthServicer()  # type: ignore[attr-defined] # bound at import
         self.port = port
 
     async def __aenter__(self) -> Self:
         self._server = grpc.aio.server(
+            interceptors=[FirstMessageDeadline(self._first_message_s)],
+            maximum_concurrent_rpcs=self._max_connections + _MORE_CALLS,
             options=[
                 # On by default, two servers would share the port and split streams silently.
                 ("grpc.so_reuseport", 0),
                 ("grpc.max_receive_message_length", self._max_message_bytes),
                 ("grpc.max_send_message_length", self._max_message_bytes),
+                ("grpc.max_allowed_incoming_connections", self._max_connections),
+                ("grpc.max_concurrent_streams", _CALLS_OF_A_CONNECTION),
+                ("grpc.server_handshake_timeout_ms", int(1000 * self._first_message_s)),
                 *_KEEPALIVE,
-            ]
+            ],
         )
         depth_pb2_grpc.add_DepthServiceServicer_to_server(self._servicer, self._server)
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)

@@ -4,6 +4,7 @@ import asyncio
 import socket
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, Self
 
 import uvicorn
@@ -12,6 +13,7 @@ from fastapi.openapi.utils import get_openapi
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
 from pydantic.json_schema import models_json_schema
 
+from vergence_service.transports.http.connections import BoundedConnection, ConnectionLimits
 from vergence_service.transports.http.errors import Problem, install_problems
 from vergence_service.transports.http.uploads import SequenceForm
 from vergence_service.transports.open_calls import OpenCalls
@@ -23,6 +25,7 @@ Live streams use gRPC (`vergence.v1.DepthService`). An error is answered with pr
 """
 # Time to finish the answers that are being sent when the server stops.
 _FINISH_S = 5
+_BACKLOG = 64
 
 
 def make_http_app(
@@ -98,9 +101,16 @@ class HttpServer:
     """
 
     def __init__(
-        self, app: FastAPI, calls: OpenCalls, *, listening: socket.socket, stopping: asyncio.Event
+        self,
+        app: FastAPI,
+        calls: OpenCalls,
+        *,
+        listening: socket.socket,
+        limits: ConnectionLimits,
+        stopping: asyncio.Event,
     ) -> None:
         self._app = app
+        self._limits = limits
         self._calls = calls
         self._socket = listening
         self._stopping = stopping
@@ -109,6 +119,9 @@ class HttpServer:
     async def __aenter__(self) -> Self:
         config = uvicorn.Config(
             self._app,
+            http=partial(BoundedConnection, self._limits),  # type: ignore[arg-type] # makes a class's instance
+            # asyncio accepts so many connections before it looks at the first of them.
+            backlog=min(_BACKLOG, self._limits.connections),
             log_config=None,
             access_log=False,
             lifespan="off",

@@ -24,6 +24,7 @@ HTTP_STATUS: Mapping[ErrorCode, int] = {
     ErrorCode.BAD_SHAPE: 400,
     ErrorCode.BAD_CALIBRATION: 400,
     ErrorCode.BAD_SEQUENCE: 400,
+    ErrorCode.CLIENT_TIMEOUT: 408,
     ErrorCode.STREAM_UNKNOWN: 404,
     ErrorCode.SEQUENCE_UNKNOWN: 404,
     ErrorCode.STREAM_EXPIRED: 410,
@@ -118,6 +119,8 @@ def _response(
     headers: Mapping[str, str] | None = None,
 ) -> JSONResponse:
     all_headers = dict(headers or {})
+    if problem.status == http.HTTPStatus.REQUEST_TIMEOUT:
+        all_headers["Connection"] = "close"  # the rest of the body is not waited for
     if retry_after_s is not None:
         all_headers["Retry-After"] = str(max(math.ceil(retry_after_s), 1))
     content = problem.model_dump(mode="json", exclude_none=True)

@@ -22,9 +22,11 @@ from vergence_proto.http_records import (
     pack_record,
 )
 from vergence_proto.v1 import depth_pb2 as pb
+from vergence_service.transports.http.bodies import body_of
 from vergence_service.transports.http.errors import PROBLEM_RESPONSE, log
 from vergence_service.transports.http.uploads import client_of
 from vergence_service.transports.open_calls import OpenCalls
+from vergence_service.transports.stream_call import ClientLost
 from vergence_service.transports.unary import UnaryMethods
 
 _BODY: dict[str, Any] = {
@@ -33,17 +35,33 @@ _BODY: dict[str, Any] = {
         "content": {PROTOBUF_TYPE: {"schema": {"type": "string", "format": "binary"}}},
     }
 }
+_Method = Callable[[Request], Coroutine[Any, Any, Message]]
 
 
-def stream_routes(calls: OpenCalls, unary: UnaryMethods) -> APIRouter:
-    """Make the routes."""
+def stream_routes(
+    calls: OpenCalls, unary: UnaryMethods, *, patience_s: float, min_bytes_per_s: float
+) -> APIRouter:
+    """Make the routes. A body that comes too slowly is refused."""
+
+    async def read(request: Request, kind: type[Any]) -> Any:
+        body = body_of(request, patience_s=patience_s, min_bytes_per_s=min_bytes_per_s)
+        return await _message(body, kind, calls)
+
+    def method(
+        question: type[Any], answer: Callable[[Any], Coroutine[Any, Any, Message]]
+    ) -> _Method:
+        async def ask(request: Request) -> Message:
+            return await answer(await read(request, question))
+
+        return ask
+
     router = APIRouter(tags=["streams"], responses=PROBLEM_RESPONSE)
     open_calls: dict[str, _HttpCall] = {}
     methods: dict[str, _Method] = {
-        "GetServerInfo": _method(pb.GetServerInfoRequest, unary.server_info),
-        "GetStream": _method(pb.GetStreamRequest, unary.stream),
-        "ResetStream": _method(pb.ResetStreamRequest, unary.reset),
-        "CloseStream": _method(pb.CloseStreamRequest, unary.close),
+        "GetServerInfo": method(pb.GetServerInfoRequest, unary.server_info),
+        "GetStream": method(pb.GetStreamRequest, unary.stream),
+        "ResetStream": method(pb.ResetStreamRequest, unary.reset),
+        "CloseStream": method(pb.CloseStreamRequest, unary.close),
     }
 
     @router.post(
@@ -55,7 +73,7 @@ def stream_routes(calls: OpenCalls, unary: UnaryMethods) -> APIRouter:
     async def open_stream(request: Request) -> StreamingResponse:
         """Open or resume a stream with a StreamDepthRequest. The answers come as records."""
         call = _HttpCall(calls, client=client_of(request))
-        first = await call.begin(await _message(request, pb.StreamDepthRequest, calls))
+        first = await call.begin(await read(request, pb.StreamDepthRequest))
         open_calls[call.call_id] = call
 
         async def records() -> AsyncIterator[bytes]:
@@ -78,7 +96,7 @@ def stream_routes(calls: OpenCalls, unary: UnaryMethods) -> APIRouter:
             raise UnknownStream("no open call has this id; open or resume the stream")
         call = open_calls[call_id]
         try:
-            await call.put(await _message(request, pb.StreamDepthRequest, calls))
+            await call.put(await read(request, pb.StreamDepthRequest))
         except DepthError as error:
             call.end(error)  # the client would wait for an answer to this message for ever
             raise
@@ -91,12 +109,14 @@ def stream_routes(calls: OpenCalls, unary: UnaryMethods) -> APIRouter:
     )
     async def ask(
         request: Request,
-        method: str = Path(description="a name in depth.proto, for example GetServerInfo"),
+        name: str = Path(
+            alias="method", description="a name in depth.proto, for example GetServerInfo"
+        ),
     ) -> Response:
         """Call a unary method of DepthService."""
-        if method not in methods:
-            raise BadShape(f"expected one of {', '.join(methods)}, got {method[:64]!r}")
-        answer = await methods[method](request, calls)
+        if name not in methods:
+            raise BadShape(f"expected one of {', '.join(methods)}, got {name[:64]!r}")
+        answer = await methods[name](request)
         return Response(answer.SerializeToString(), media_type=PROTOBUF_TYPE)
 
     return router
@@ -111,7 +131,7 @@ class _HttpCall:
         self._calls = calls
         # Room for one each: the faster side waits for the slower, as on a full connection.
         self._incoming: asyncio.Queue[pb.StreamDepthRequest] = asyncio.Queue(1)
-        self._outgoing: asyncio.Queue[bytes] = asyncio.Queue(1)
+        self._outgoing: asyncio.Queue[bytes | None] = asyncio.Queue(1)  # None: nothing follows
         self._ended = asyncio.Event()
         self._opened = False
         self._refusal: DepthError | None = None  # the error of the opening
@@ -123,6 +143,7 @@ class _HttpCall:
         first = await self._outgoing.get()
         if self._refusal is not None:
             raise self._refusal
+        assert first is not None  # the opening is answered before a client can be lost
         return first
 
     async def put(self, message: pb.StreamDepthRequest) -> None:
@@ -139,24 +160,32 @@ class _HttpCall:
 
     async def records(self) -> AsyncIterator[bytes]:
         while not (self._ended.is_set() and self._outgoing.empty()):
-            yield await self._outgoing.get()
+            if (record := await self._outgoing.get()) is None:
+                return
+            yield record
 
     async def leave(self) -> None:
         """End the call: the client is gone or has every answer. The stream may be resumed."""
+        self._ended.set()  # a message that waits to be accepted waits no longer
         self._task.cancel()
         await asyncio.gather(self._task, return_exceptions=True)
 
     async def _run(self) -> None:
-        end = b""
+        end: bytes | None = b""  # None: no end record; to the client, the answer breaks off
         try:
             await self._calls.run(self._call)
         except DepthError as error:
             end = self._end_record(error)
+        except ClientLost as lost:
+            log.info("a call over HTTP counts as lost: %s", lost)
+            if not self._outgoing.empty():
+                self._outgoing.get_nowait()
+            end = None
         except Exception as error:
             log.error("a call failed with an unexpected error", exc_info=error)
             end = self._end_record(ModelFailed("the server failed; its log has the reason"))
         # Not in a ``finally``: if the call was cancelled, no client is left to report to.
-        await self._outgoing.put(pack_record(RecordKind.END, end))
+        await self._outgoing.put(None if end is None else pack_record(RecordKind.END, end))
         self._ended.set()
 
     def _end_record(self, error: DepthError) -> bytes:
@@ -176,24 +205,14 @@ class _HttpCall:
         await self._outgoing.put(pack_record(RecordKind.MESSAGE, response.SerializeToString()))
 
 
-_Method = Callable[[Request, OpenCalls], Coroutine[Any, Any, Message]]
-
-
-def _method(question: type[Any], answer: Callable[[Any], Coroutine[Any, Any, Message]]) -> _Method:
-    async def ask(request: Request, calls: OpenCalls) -> Message:
-        return await answer(await _message(request, question, calls))
-
-    return ask
-
-
-async def _message(request: Request, kind: type[Any], calls: OpenCalls) -> Any:
+async def _message(chunks: AsyncIterator[bytes], kind: type[Any], calls: OpenCalls) -> Any:
     """Read the body as a message of ``kind``.
 
     Raises FrameTooLarge if it is too long, and BadShape if it is another message.
     """
     limit = calls.limits.max_frame_bytes
     body = bytearray()
-    async for chunk in request.stream():
+    async for chunk in chunks:
         body += chunk
         if len(body) > limit + 4096:  # room for the fields beside the images
             raise FrameTooLarge(f"expected a message of at most {limit} bytes")

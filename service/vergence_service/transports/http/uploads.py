@@ -21,6 +21,7 @@ from vergence_proto.datasets.files import decoded_text
 from vergence_proto.errors import BadSequence, UploadTooLarge
 from vergence_service.jobs.archives import ArchiveLimits, unpacking
 from vergence_service.threads import ThreadPool
+from vergence_service.transports.http.bodies import body_of
 from vergence_service.transports.http.forms import FormPart, FormWriter
 
 FORM_TYPE = "multipart/form-data"
@@ -44,6 +45,7 @@ class UploadLimits:
 
     max_bytes: int
     idle_s: float  # abort an upload that sends nothing for this long
+    min_bytes_per_s: float  # or that is slower than this for as long
     archive: ArchiveLimits
 
 
@@ -160,23 +162,15 @@ async def _chunks(request: Request, limits: UploadLimits) -> AsyncIterator[bytes
     if int(request.headers.get("content-length", 0)) > limits.max_bytes:
         raise too_large
     received = 0
-    stream = aiter(request.stream())
-    while True:
-        try:
-            async with asyncio.timeout(limits.idle_s):
-                chunk = await anext(stream, None)
-        except TimeoutError:
-            raise BadSequence(
-                f"the upload stopped for {limits.idle_s:g} s after {received} bytes"
-            ) from None
-        except ClientDisconnect:  # the client is gone; only a proxy may still log this error
-            raise BadSequence(f"the upload broke off after {received} bytes") from None
-        if chunk is None:
-            return
-        received += len(chunk)
-        if received > limits.max_bytes:
-            raise too_large
-        yield chunk
+    chunks = body_of(request, patience_s=limits.idle_s, min_bytes_per_s=limits.min_bytes_per_s)
+    try:
+        async for chunk in chunks:
+            received += len(chunk)
+            if received > limits.max_bytes:
+                raise too_large
+            yield chunk
+    except ClientDisconnect:  # the client is gone; only a proxy may still log this error
+        raise BadSequence(f"the upload broke off after {received} bytes") from None
 
 
 def _unpacking(archive: Path, folder: Path, limits: UploadLimits) -> Iterator[None]:

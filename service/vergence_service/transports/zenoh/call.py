@@ -1,5 +1,6 @@
 """One StreamDepth call over Zenoh: the keys of one stream instead of a connection."""
 
+import logging
 from collections.abc import AsyncIterator
 
 import zenoh
@@ -12,7 +13,10 @@ from vergence_proto.zenoh.inbox import Inbox
 from vergence_proto.zenoh.keys import OPEN, StreamKeys, query_key
 from vergence_proto.zenoh.session import Declaration, ZenohSession
 from vergence_service.transports.open_calls import OpenCalls
+from vergence_service.transports.stream_call import ClientLost
 from vergence_service.transports.zenoh.errors import status_of
+
+log = logging.getLogger(__name__)
 
 
 class ZenohCall:
@@ -56,6 +60,9 @@ class ZenohCall:
         end: Message = pb.End()
         try:
             await self._calls.run(self._call)
+        except ClientLost as lost:
+            log.info("a call over Zenoh counts as lost: %s", lost)
+            return  # to a client that wakes up, the server does not answer any more
         except Exception as error:
             end = status_of(error)
         finally:

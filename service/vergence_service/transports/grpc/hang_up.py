@@ -1,0 +1,81 @@
+"""End a call whose client does not listen.
+
+A status cannot reach a client that does not read: it waits behind the messages before it. gRPC for
+Python has no method that ends a call without a status.
+"""
+
+import asyncio
+import os
+import socket
+import threading
+from contextlib import suppress
+from typing import Any
+from urllib.parse import unquote
+
+import grpc
+from grpc._cython import cygrpc  # type: ignore[attr-defined] # published without types
+
+from vergence_service.transports.grpc.errors import Context
+
+# Time for the status to reach a client that is silent but reads.
+_STATUS_S = 1.0
+
+
+async def hang_up(context: Context, why: str, *, shared: bool) -> None:
+    """End the call with UNAVAILABLE, as if its connection were lost. Does not return.
+
+    If the client does not read, end the call without a status, or, unless the connection is
+    ``shared`` by other calls, close the connection.
+    """
+    with suppress(TimeoutError):
+        async with asyncio.timeout(_STATUS_S):
+            await context.abort(grpc.StatusCode.UNAVAILABLE, why)
+    if shared or not _close_connection(context.peer()):
+        _cancel(context)
+    raise asyncio.CancelledError  # gRPC takes this as the end of a call that was cancelled
+
+
+def _close_connection(peer: str) -> bool:
+    """Close the TCP connection to ``peer``, as gRPC states it. Return True if it was found."""
+    _, _, address = unquote(peer).partition(":")
+    host, _, port = address.rpartition(":")
+    for descriptor in _descriptors():
+        with suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as connection:
+            name = connection.getpeername()
+            if (
+                isinstance(name, tuple)
+                and str(name[1]) == port
+                and name[0].removeprefix("::ffff:") == host.strip("[]")
+            ):
+                connection.shutdown(socket.SHUT_RDWR)
+                return True
+    return False
+
+
+def _descriptors() -> list[int]:
+    try:
+        return [int(name) for name in os.listdir("/dev/fd")]  # Linux and macOS
+    except OSError:
+        return []
+
+
+def _cancel(context: Context) -> None:
+    """Cancel a call.
+
+    Only gRPC's own functions get at the call behind a context. This takes the place of one of them
+    for as long as ``context.auth_context`` needs to call it.
+    """
+    here = threading.get_ident()
+    theirs = cygrpc.auth_context
+
+    def cancel(call: Any) -> Any:
+        if threading.get_ident() != here:
+            return theirs(call)
+        call.cancel(grpc.StatusCode.UNAVAILABLE.value[0], "the client does not read")
+        return {}
+
+    cygrpc.auth_context = cancel
+    try:
+        context.auth_context()
+    finally:
+        cygrpc.auth_context = theirs
