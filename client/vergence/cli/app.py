@@ -241,6 +241,11 @@ def _calib(
 
 @app.command("doctor")
 def _doctor(
+    source: Annotated[
+        str | None,
+        typer.Argument(help="KIND:PATH of a recording to examine, in place of this machine."),
+    ] = None,
+    *,
     server: Annotated[
         str,
         typer.Option(
@@ -248,7 +253,17 @@ def _doctor(
         ),
     ] = DEFAULT_SERVER,
 ) -> None:
-    """Report what is installed, what is missing, and whether a server answers."""
+    """Report what is installed, what is missing, and whether a server answers.
+
+    With a recording: find swapped eyes, rows or times that do not fit, a wrong baseline or focal
+    length, and poses of other axes, inverted, or of another time.
+    """
+    if source is not None:
+        from vergence.cli.doctor import examine
+
+        if not examine(source, _console()):
+            raise typer.Exit(1)
+        return
     from vergence.cli.doctor import doctor
 
     if not _await(doctor(server, _console())):

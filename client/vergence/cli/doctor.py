@@ -14,7 +14,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from vergence.cli.errors import CliError
+from vergence.cli.sources import source_at
 from vergence.client import DepthClient
+from vergence_proto.datasets import DatasetError
 from vergence_proto.errors import DepthError
 from vergence_proto.extras import Extra, how_to_install
 from vergence_proto.instruction_set import UNKNOWN, instruction_set
@@ -57,6 +60,30 @@ async def doctor(server: str, console: Console) -> bool:
         table.add_row(finding.verdict.value, Text(finding.what), Text(finding.detail))
     console.print(table)
     return all(finding.verdict is not Verdict.BAD for finding in findings)
+
+
+def examine(text: str, console: Console) -> bool:
+    """Print what is wrong with a recording ``KIND:PATH``; return whether nothing is.
+
+    Raises CliError: it does not exist, or is damaged.
+    """
+    from vergence.source_check import check_source
+
+    source = source_at(text).without_truth()
+    has_poses = all(each.world_from_left is not None for each in source.files)
+    with console.status(f"matching the images of {source.name}"):
+        try:
+            found = check_source(source)
+        except DatasetError as error:
+            raise CliError(str(error), exit_code=2) from None
+    for advice in found:
+        console.print(Text(f"{advice.mistake}: {advice.sentence}"), style="yellow")
+    if not found:
+        looked_at = "images, poses and calibration" if has_poses else "images and calibration"
+        console.print(f"{source.name}: nothing wrong; {looked_at} fit each other")
+    if not has_poses:
+        console.print("Not every frame has a pose, so motion was not examined.")
+    return not found
 
 
 def _python() -> Finding:
