@@ -18,6 +18,7 @@ from vergence.cli.sources import source_at
 from vergence.cli.streaming import AnsweredFrame, every_frame
 from vergence.client import DepthClient
 from vergence_proto.datasets import SourceFrame, StereoSource
+from vergence_proto.film import CannotFilm
 from vergence_proto.types import Delivery
 
 _FPS_UNKNOWN = 30.0
@@ -74,7 +75,7 @@ def _draw(
         with Video(out / "demo.mp4", rows[0], title=title, fps=source.fps or _FPS_UNKNOWN) as video:
             for row in rows:
                 video.add(row)
-    except OSError as error:  # a build of OpenCV without a video encoder
+    except CannotFilm as error:
         console.print(f"[yellow]no video: {error}[/]")
     else:
         console.print(f"video    {out / 'demo.mp4'}")

@@ -26,6 +26,7 @@ from vergence_proto.model_io import ManifestError, load_model_card
 # The packages of each extra, and of the base install.
 _PACKAGES: dict[Extra | None, tuple[str, ...]] = {
     None: ("grpcio", "numpy", "opencv-python-headless", "protobuf"),
+    "cli": ("av", "httpx", "rich", "typer"),
     "server": ("fastapi", "grpcio-health-checking", "onnxruntime", "prometheus-client", "uvicorn"),
     "zenoh": ("eclipse-zenoh",),
     "train": ("torch", "onnx", "onnxscript"),

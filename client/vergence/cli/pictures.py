@@ -13,6 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vergence_proto.film import FilmWriter
+
 Picture = NDArray[np.uint8]  # [H, W, 3], BGR
 Map = NDArray[np.float32]  # [H, W], NaN = no value
 
@@ -109,7 +111,7 @@ def sheet(title: str, rows: Sequence[Row], *, panel_width: int = 480) -> Picture
 class Video:
     """An MP4 with one row per frame; use it inside ``with``.
 
-    Raises OSError: OpenCV cannot write the file.
+    Raises CannotFilm: the file cannot be written, or PyAV is missing.
     """
 
     def __init__(self, path: Path, first: Row, *, title: str, fps: float) -> None:
@@ -118,11 +120,7 @@ class Video:
         )
         self._heading = _heading(title, first, 480)
         self._scales = _scales(first, self._scale, 480)
-        height, width = self._compose(first).shape[:2]
-        codec = cv2.VideoWriter.fourcc(*"mp4v")
-        self._writer = cv2.VideoWriter(str(path), codec, fps, (width, height))
-        if not self._writer.isOpened():
-            raise OSError(f"OpenCV cannot write the video {path}")
+        self._film = FilmWriter(path, fps=fps)
 
     def __enter__(self) -> Self:
         return self
@@ -133,16 +131,12 @@ class Video:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._writer.release()
+        self._film.__exit__(kind, error, trace)
 
     def add(self, row: Row) -> None:
         """Append a frame."""
-        self._writer.write(self._compose(row))
-
-    def _compose(self, row: Row) -> Picture:
         picture = np.vstack([self._heading, _strip(row, self._scale, 480), self._scales])
-        height, width = picture.shape[:2]
-        return picture[: height - height % 2, : width - width % 2]  # video codecs need even sizes
+        self._film.add(picture[..., ::-1])  # BGR to RGB
 
 
 def _heading(title: str, row: Row, panel_width: int) -> Picture:

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vergence_proto.datasets import StereoSource, encode_disparity_png, encode_pfm
+from vergence_proto.film import CannotFilm, FilmWriter
 from vergence_proto.geometry import RectifiedRig
 from vergence_proto.jobs import Output, ResultFormat
 from vergence_proto.types import DisparityMap, Plane
@@ -36,7 +37,7 @@ _COLOUR_RANGE_PCT = (1, 99)
 
 
 class CannotEncode(RuntimeError):
-    """OpenCV on this machine cannot write the format."""
+    """The format cannot be written on this machine."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,26 +162,22 @@ def _npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
 
 
 def _writing_mp4(path: Path, frames: Iterator[Plane], fps: float) -> Iterator[None]:
-    writer: cv2.VideoWriter | None = None
     low = high = 0.0
-    for offset_px in frames:
-        height, width = offset_px.shape
-        known = np.isfinite(offset_px)
-        if writer is None:
-            code = cv2.VideoWriter.fourcc(*"mp4v")
-            writer = cv2.VideoWriter(str(path), code, fps, (width, height))
-            if not writer.isOpened():
-                raise CannotEncode("OpenCV cannot write MP4 here; choose another format")
-            if known.any():
+    try:
+        film = FilmWriter(path, fps=fps)
+    except CannotFilm as error:
+        raise CannotEncode(f"{error}; choose another format") from None
+    with film:
+        for index, offset_px in enumerate(frames):
+            known = np.isfinite(offset_px)
+            if index == 0 and known.any():
                 low, high = np.percentile(offset_px[known], _COLOUR_RANGE_PCT)
-        share = (np.nan_to_num(offset_px) - low) / max(high - low, 1e-6)
-        levels = (255 * np.clip(share, 0, 1)).astype(np.uint8)
-        colours = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)
-        colours[~known] = 0
-        writer.write(colours)
-        yield
-    if writer is not None:
-        writer.release()
+            share = (np.nan_to_num(offset_px) - low) / max(high - low, 1e-6)
+            levels = (255 * np.clip(share, 0, 1)).astype(np.uint8)
+            colours = np.asarray(cv2.applyColorMap(levels, cv2.COLORMAP_TURBO), np.uint8)
+            colours[~known] = 0
+            film.add(colours[..., ::-1])  # BGR to RGB
+            yield
 
 
 class _Sink(io.RawIOBase):
