@@ -11,6 +11,7 @@ from vergence.results import SessionEvent
 from vergence.session import DepthSession, SessionSetup
 from vergence.transports.addresses import DEFAULT_SERVER, connector, on_this_machine
 from vergence.transports.base import Transport
+from vergence.units import warn_of_baseline
 from vergence_proto import codec
 from vergence_proto.geometry import Axes, RectifiedRig
 from vergence_proto.types import Delivery, ImageEncoding, OutputFormat, StereoRig, checked_stream_id
@@ -107,6 +108,7 @@ class DepthClient:
             The client is not open.
         """
         transport = self._open_transport()
+        warn_of_baseline(rig)
         opening = pb.OpenStream(
             stream_id=checked_stream_id(uuid.uuid4().hex if stream_id is None else stream_id),
             resume_token=resume_token,

@@ -1,10 +1,10 @@
 """Routing of a stream's responses to the calls and readers that wait for them."""
 
 import asyncio
-import time
 from collections import deque
 from dataclasses import fields
 
+from vergence.capture_clock import age_of
 from vergence.connection import RESET
 from vergence.in_flight import FramesInFlight
 from vergence.recent import RecentResults
@@ -88,7 +88,7 @@ class ResponseRouter:
                     self._dropped(frame_id)
 
     def _map(self, message: pb.DisparityMap) -> None:
-        age_s = (time.monotonic_ns() - message.capture_ns) * 1e-9
+        age_s = age_of(message.capture_ns)
         if self.reset_after is not None and message.frame_id > self.reset_after:
             self.reset_after = None
         try:

@@ -43,7 +43,10 @@ class DepthResult(DisparityMap):
     """
 
     age_s: float = 0.0
-    """Seconds from ``capture_ns`` to the arrival of this result."""
+    """Seconds from ``capture_ns`` to the arrival of this result.
+
+    NaN if ``capture_ns`` is not a time of ``time.monotonic_ns()``, as in a recording.
+    """
     drops: Drops = field(default_factory=Drops)
     """The drops of the session until this result."""
     axes: Axes = Axes.OPENCV

@@ -1,15 +1,15 @@
 """One stereo stream from the client's side: frames in, depth out."""
 
 import asyncio
-import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vergence.capture_clock import CaptureClock
 from vergence.connection import RESET, StreamConnection
 from vergence.errors import NotOpen, WrongDelivery
 from vergence.in_flight import FrameInFlight, FramesInFlight
@@ -24,7 +24,7 @@ from vergence_proto.geometry import Matrix, Pose, RectifiedRig
 from vergence_proto.types import Delivery, ImageEncoding, PoseSample, StereoFrame
 from vergence_proto.v1 import depth_pb2 as pb
 
-WorldFromLeft = Pose | PoseSample | Matrix | None
+WorldFromLeft = Pose | PoseSample | Matrix | Sequence[Sequence[float]] | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,6 +78,7 @@ class DepthSession:
         self._connection = StreamConnection(
             setup.transport, setup.opening, self._responses, setup.on_event
         )
+        self._clock = CaptureClock(live=setup.delivery is Delivery.NEWEST)
         self._turn = asyncio.Lock()
         self._next_id = 1
 
@@ -234,7 +235,8 @@ class DepthSession:
         world_from_left
             The left camera's pose at mid-exposure; None: not known.
         capture_ns
-            ``time.monotonic_ns()`` at mid-exposure; default: now.
+            ``time.monotonic_ns()`` at mid-exposure; default: now. Another clock in nanoseconds
+            will do; then the ages of results are NaN.
         max_age_s
             A frame that waits in the server for longer is dropped (``drops.stale``).
 
@@ -250,6 +252,8 @@ class DepthSession:
             An image is not uint8, or has another shape than those above.
         BadPose
             The pose is not finite, or its rotation is not orthonormal with determinant +1.
+        BadShape
+            ``capture_ns`` is no whole number of 64 bits.
         WrongDelivery
             The session's delivery is EVERY, which must not drop frames; use :meth:`step`.
         NotOpen
@@ -287,7 +291,7 @@ class DepthSession:
         BadPose
             The pose is not finite, or its rotation is not orthonormal with determinant +1.
         BadShape
-            The images do not have the rig's size.
+            The images do not have the rig's size, or ``capture_ns`` is no whole number.
         FrameTooLarge
             The frame has more bytes than the server accepts.
         FrameStale
@@ -378,11 +382,11 @@ class DepthSession:
         capture_ns: int | None,
         max_age_s: float | None,
     ) -> bytes:
-        if isinstance(world_from_left, np.ndarray):
+        if world_from_left is not None and not isinstance(world_from_left, (Pose, PoseSample)):
             world_from_left = Pose.from_matrix(world_from_left)
         if isinstance(world_from_left, Pose):
             world_from_left = PoseSample(world_from_left)
-        capture_ns = time.monotonic_ns() if capture_ns is None else capture_ns
+        capture_ns = self._clock.checked_ns(capture_ns)
         frame = StereoFrame(self._next_id, capture_ns, left, right, world_from_left)
         return codec.frame_to_request(
             frame,

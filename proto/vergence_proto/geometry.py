@@ -5,6 +5,7 @@ Names say both frames: ``a_from_b`` maps b-coordinates to a, and in a product th
 OpenCV axes (x right, y down, z forward), every length is in metres, every disparity in pixels.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Self
@@ -25,7 +26,13 @@ class Pose:
     """A rigid transform ``p_a = rotation @ p_b + translation_m``, in float64.
 
     Variables that hold a pose are named ``a_from_b``: it maps b-coordinates to a-coordinates. The
-    constructor stores its arguments and checks nothing.
+    constructor takes lists too, and a translation [3, 1] as OpenCV returns it. It checks shapes and
+    not that the rotation is one.
+
+    Raises
+    ------
+    BadPose
+        The rotation is not [3, 3] or the translation not [3], or they are no numbers.
     """
 
     rotation: Matrix
@@ -33,16 +40,29 @@ class Pose:
     translation_m: Matrix
     """Float64 [3], metres: the origin of b in a-coordinates."""
 
+    def __post_init__(self) -> None:
+        rotation = _float64(self.rotation, "a rotation [3, 3]")
+        translation_m = _float64(self.translation_m, "a translation [3]")
+        if translation_m.shape in ((3, 1), (1, 3)):
+            translation_m = translation_m.ravel()
+        if rotation.shape != (3, 3) or translation_m.shape != (3,):
+            raise BadPose(
+                "expected a rotation [3, 3] and a translation [3], got shapes "
+                f"{list(rotation.shape)} and {list(translation_m.shape)}"
+            )
+        object.__setattr__(self, "rotation", rotation)
+        object.__setattr__(self, "translation_m", translation_m)
+
     @classmethod
     def identity(cls) -> Self:
         """Return the pose that changes nothing."""
         return cls(np.eye(3), np.zeros(3))
 
     @classmethod
-    def from_matrix(cls, matrix: Matrix) -> Self:
+    def from_matrix(cls, matrix: Matrix | Sequence[Sequence[float]]) -> Self:
         """Make a pose of a [3, 4] or [4, 4] row-major matrix, rotation left of translation.
 
-        The input is converted to float64 and copied.
+        The input, an array or lists of rows, is converted to float64 and copied.
 
         Raises
         ------
@@ -55,7 +75,13 @@ class Pose:
         if values.shape not in ((3, 4), (4, 4)):
             raise BadPose(
                 f"expected a [3, 4] or [4, 4] matrix, got shape {list(values.shape)}; "
-                "put the rotation left of the translation"
+                "put the rotation left of the translation, or make a pose of a quaternion by "
+                "Pose.from_xyzw"
+            )
+        if not np.isfinite(values).all():
+            raise BadPose(
+                f"expected a pose of finite numbers, got {values.tolist()}; "
+                "if tracking is lost, send the frame without a pose"
             )
         rotation, translation_m = values[:3, :3].copy(), values[:3, 3].copy()
         if len(values) == 4 and not np.abs(values[3] - (0, 0, 0, 1)).max() <= _RIGID_TOLERANCE:
@@ -64,8 +90,6 @@ class Pose:
                 "a pose is row-major: a matrix of a graphics library may have to be transposed"
             )
         check_rotation(rotation)
-        if not np.isfinite(translation_m).all():
-            raise BadPose(f"expected a finite translation, got {translation_m.tolist()}")
         return cls(rotation, translation_m)
 
     @classmethod
@@ -79,16 +103,11 @@ class Pose:
         BadPose
             A shape is another one, a number is not finite, or the quaternion is zero.
         """
-        for name, values, size in (
-            ("quaternion x y z w", orientation_xyzw, 4),
-            ("translation x y z", translation_m, 3),
-        ):
-            numbers = _float64(values, f"a {name}")
-            if numbers.shape != (size,) or not np.isfinite(numbers).all():
-                raise BadPose(f"expected a {name} of {size} finite numbers, got {numbers.tolist()}")
-        if not np.any(orientation_xyzw):
+        quaternion = _vector(orientation_xyzw, 4, "a quaternion x y z w")
+        translation_m = _vector(translation_m, 3, "a translation x y z")
+        if not np.any(quaternion):
             raise BadPose("expected a quaternion x y z w of non-zero length, got zeros")
-        x, y, z, w = np.asarray(orientation_xyzw, np.float64) / np.linalg.norm(orientation_xyzw)
+        x, y, z, w = quaternion / np.linalg.norm(quaternion)
         rotation = np.array(
             [
                 [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -96,7 +115,7 @@ class Pose:
                 [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
             ]
         )
-        return cls(rotation, np.array(translation_m, np.float64))
+        return cls(rotation, translation_m)
 
     @property
     def orientation_xyzw(self) -> Matrix:
@@ -295,6 +314,16 @@ def check_rotation(rotation: Matrix) -> None:
         f"{rotation.tolist()}; remove scale and shear, and state left-handed poses by the axes of "
         "the session and not by a mirrored matrix"
     )
+
+
+def _vector(values: object, size: int, expected: str) -> Matrix:
+    """Return finite numbers [size]; OpenCV's [size, 1] will do."""
+    numbers = _float64(values, expected)
+    if numbers.shape in ((size, 1), (1, size)):
+        numbers = numbers.ravel()
+    if numbers.shape != (size,) or not np.isfinite(numbers).all():
+        raise BadPose(f"expected {expected} of {size} finite numbers, got {numbers.tolist()}")
+    return numbers.copy()
 
 
 def _float64(values: object, expected: str) -> Matrix:

@@ -145,7 +145,7 @@ def load_model_card(weights_dir: Path, name: str) -> ModelCard:
     """
     path = weights_dir / MANIFEST_NAME
     try:
-        manifest = json.loads(path.read_text("utf-8"))
+        manifest = json.loads(path.read_bytes())
     except FileNotFoundError:
         raise ManifestError(f"no manifest at {path}; export a model there first") from None
     except json.JSONDecodeError as error:

@@ -30,7 +30,8 @@ class Distortion(Enum):
     NONE = "none"
     """A pinhole camera without coefficients."""
     BROWN_CONRADY = "brown-conrady"
-    """Radial and tangential: k1 k2 p1 p2 [k3 [k4 k5 k6]], in OpenCV's order."""
+    """Radial and tangential: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]], in OpenCV's order,
+    with thin prisms (s) and a tilted sensor (t)."""
     KANNALA_BRANDT = "kannala-brandt"
     """Fisheye: k1 k2 k3 k4, in OpenCV's order."""
 
@@ -64,6 +65,13 @@ class Intrinsics:
     """Distortion coefficients in OpenCV's order; empty for ``Distortion.NONE``."""
 
     def __post_init__(self) -> None:
+        try:
+            flat = np.ravel(np.asarray(self.coefficients, np.float64))  # OpenCV returns [1, n]
+        except (TypeError, ValueError):
+            raise BadCalibration(
+                f"expected distortion coefficients as numbers, got {self.coefficients!r}"
+            ) from None
+        object.__setattr__(self, "coefficients", tuple(flat.tolist()))
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.coefficients)
         if not np.isfinite(numbers).all():
             raise BadCalibration(f"intrinsics must be finite, got {numbers}")
@@ -88,7 +96,7 @@ class Intrinsics:
 
 _COEFFICIENT_COUNTS = {
     Distortion.NONE: (0,),
-    Distortion.BROWN_CONRADY: (4, 5, 8),
+    Distortion.BROWN_CONRADY: (4, 5, 8, 12, 14),
     Distortion.KANNALA_BRANDT: (4,),
 }
 
@@ -117,6 +125,8 @@ class StereoRig:
                 f"and right {self.right.width}x{self.right.height}"
             )
         try:
+            if not isinstance(self.left_from_right, Pose):  # a matrix
+                object.__setattr__(self, "left_from_right", Pose.from_matrix(self.left_from_right))
             check_rotation(self.left_from_right.rotation)
         except BadPose as error:
             raise BadCalibration(f"left_from_right: {error}") from None
@@ -195,6 +205,10 @@ class PoseSample:
     """The position can be used."""
     tracked: bool = True
     """The pose was measured, and not predicted or inferred."""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.world_from_left, Pose):  # a matrix
+            object.__setattr__(self, "world_from_left", Pose.from_matrix(self.world_from_left))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -158,3 +158,54 @@ def test_a_rig_that_cannot_be_rectified_is_refused(
 @pytest.mark.parametrize("rig", [*RIGS.values(), StereoRig.from_rectified(RIG)])
 def test_a_rig_that_can_be_rectified_passes_the_check(rig: StereoRig) -> None:
     check_rig(rig, REACH)
+
+
+def fisheye(focal_px: float, turn: Pose = LEFT_FROM_RIGHT) -> StereoRig:
+    each = Intrinsics(
+        640, 480, focal_px, focal_px, 319.5, 239.5, Distortion.KANNALA_BRANDT, (0.0,) * 4
+    )
+    return StereoRig(each, each, turn)
+
+
+@pytest.mark.parametrize("degrees", [100, 140, 160, 179, 200, 229, 280])
+def test_a_wide_fisheye_keeps_its_resolution_ahead(degrees: int) -> None:
+    focal_px = 320 / np.radians(degrees / 2)
+    rig = fisheye(focal_px)
+    rectifier = Rectifier.of(rig, REACH)
+    stated = rectifier.rig
+    assert stated.fx == stated.fy
+    # A pixel ahead is no larger than a quarter more, and the view is no wider than a plane shows.
+    assert stated.fx >= 0.8 * min(focal_px, 320 / np.tan(np.radians(55))) - 1e-9
+    assert stated.baseline_m == pytest.approx(np.linalg.norm(LEFT_FROM_RIGHT.translation_m))
+    # The old and the new camera agree where a point ahead is.
+    point = np.array([0.1, -0.1, 2.0])
+    x, y, z = rectifier.left_from_rectified.inverse().apply(point)
+    u, v = stated.fx * x / z + stated.cx_left, stated.fy * y / z + stated.cy
+    maps = rectifier.maps
+    assert maps is not None
+    seen_at = maps[0].whole[round(v), round(u)]
+    np.testing.assert_allclose(seen_at, project(point[None], rig.left)[0], atol=1.5)
+    assert rectifier.seen is not None
+    assert rectifier.seen[round(v), round(u)]
+
+
+def test_fisheyes_that_look_apart_are_refused() -> None:
+    apart = Pose.from_xyzw(np.array([0.0, 0.8, 0.0, 0.6]), np.array([0.1, 0.0, 0.0]))
+    with pytest.raises(BadCalibration, match=r"one direction|no pixel"):
+        Rectifier.of(fisheye(160.0, apart), REACH)
+
+
+@pytest.mark.parametrize("tail", [(0.0,) * 6, (0.001, -0.001, 0.0005, 0.0, 0.01, -0.02)])
+def test_twelve_and_fourteen_coefficients_bend_as_opencv_bends(tail: tuple[float, ...]) -> None:
+    coefficients = (-0.1, 0.02, 0.001, -0.001, 0.0, 0.0, 0.0, 0.0, *tail)
+    bent = Intrinsics(
+        WIDTH, HEIGHT, 240.0, 240.0, 158.0, 121.0, Distortion.BROWN_CONRADY, coefficients
+    )
+    rig = StereoRig(bent, bent, LEFT_FROM_RIGHT)
+    rectifier = Rectifier.of(rig, REACH)
+    point = np.array([0.15, -0.1, 1.4])
+    left, _ = rectifier.rectify(*[blob(project(point[None], rig.left)[0])] * 2)
+    x, y, z = rectifier.left_from_rectified.inverse().apply(point)
+    stated = rectifier.rig
+    expected = [stated.fx * x / z + stated.cx_left, stated.fy * y / z + stated.cy]
+    np.testing.assert_allclose(centre(left), expected, atol=0.15)

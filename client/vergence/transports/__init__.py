@@ -2,6 +2,6 @@
 
 import os
 
-# gRPC's own handlers of fork crash the child while a channel is open. Without them the child can
-# still be told what is wrong, and a fork before or after works.
+# gRPC's own handlers of fork crash the child while a channel is open. Without them it lives to be
+# told what is wrong.
 os.environ.setdefault("GRPC_ENABLE_FORK_SUPPORT", "0")

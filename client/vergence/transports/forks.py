@@ -1,40 +1,31 @@
-"""Detection of processes that were forked while gRPC was in use, in which it cannot work."""
+"""Detection of processes that were forked after gRPC was used, in which it hangs or crashes."""
 
-import gc
 import os
-from weakref import WeakSet
 
 from vergence.transports.base import ConnectionLost
 
 FORKED = (
-    "this process was forked while a Vergence client was open, and connections do not survive a "
-    "fork; start processes with multiprocessing.get_context('spawn'), or open clients after it"
+    "this process was forked after a Vergence client was opened, and gRPC does not survive a fork; "
+    "start processes with multiprocessing.get_context('spawn'), open the first client after the "
+    "fork, or use http://"
 )
 
-_alive: WeakSet[object] = WeakSet()  # channels and calls: gRPC's threads run as long as one exists
-_forked_while_alive = False
+_used = False  # by this process or the one that it was forked from
+_forked_after_use = False
 
 
-def check_not_forked() -> None:
-    """Raise ConnectionLost if gRPC cannot work in this process."""
-    if _forked_while_alive:
+def use_grpc() -> None:
+    """Record that this process uses gRPC. Raises ConnectionLost: it cannot."""
+    global _used
+    if _forked_after_use:
         raise ConnectionLost(FORKED)
-
-
-def watch(used: object) -> None:
-    """Record a channel or a call. A process that is forked while it exists is told."""
-    _alive.add(used)
-
-
-def _before_fork() -> None:
-    if _alive:
-        gc.collect()  # a call that has ended is part of a cycle
+    _used = True
 
 
 def _after_fork() -> None:
-    global _forked_while_alive
-    _forked_while_alive = _forked_while_alive or len(_alive) > 0
+    global _forked_after_use
+    _forked_after_use = _used
 
 
 if hasattr(os, "register_at_fork"):  # Windows has no fork
-    os.register_at_fork(before=_before_fork, after_in_child=_after_fork)
+    os.register_at_fork(after_in_child=_after_fork)

@@ -8,8 +8,8 @@ import grpc
 from google.protobuf.message import Message
 from grpc_status import rpc_status
 
-from vergence.transports import forks
 from vergence.transports.base import Answer, Call, ConnectionLost
+from vergence.transports.forks import use_grpc
 from vergence.transports.proxies import through_proxy
 from vergence_proto import codec
 from vergence_proto.errors import DepthError, FrameTooLarge, NotReady
@@ -43,20 +43,18 @@ class GrpcTransport:
     """The :class:`~vergence.transports.base.Transport` to one ``host:port``, in the clear.
 
     ``direct``: without the web proxy that the environment may name.
-    Raises ConnectionLost: the process was forked while another client was open.
+    Raises ConnectionLost: the process was forked after gRPC was used.
     """
 
     def __init__(self, address: str, *, direct: bool = False) -> None:
-        forks.check_not_forked()
+        use_grpc()
         self._address = address
         options = (*_CHANNEL_OPTIONS, ("grpc.enable_http_proxy", int(not direct)))
-        self._channel: grpc.aio.Channel | None
         self._channel = grpc.aio.insecure_channel(address, options=options)
-        forks.watch(self._channel)
         self._through = "" if direct else through_proxy(f"grpc://{address}")
 
     async def open_call(self, stream_id: str) -> Call:
-        start = self._open_channel().stream_stream(
+        start = self._channel.stream_stream(
             f"{_SERVICE}StreamDepth",
             request_serializer=bytes,  # requests are serialized already
             response_deserializer=pb.StreamDepthResponse.FromString,
@@ -65,7 +63,7 @@ class GrpcTransport:
         return _GrpcCall(call, self._address, self._through)
 
     async def ask(self, method: str, request: Message, answer: type[Answer]) -> Answer:
-        invoke = self._open_channel().unary_unary(
+        invoke = self._channel.unary_unary(
             f"{_SERVICE}{method}",
             request_serializer=type(request).SerializeToString,
             response_deserializer=answer.FromString,
@@ -77,14 +75,7 @@ class GrpcTransport:
         return response
 
     async def close(self) -> None:
-        channel, self._channel = self._channel, None  # a session may keep this transport for long
-        if channel is not None:
-            await channel.close(grace=None)
-
-    def _open_channel(self) -> grpc.aio.Channel:
-        if self._channel is None:
-            raise ConnectionLost(f"the connection to {self._address} was closed")
-        return self._channel
+        await self._channel.close(grace=None)
 
 
 class _GrpcCall:
@@ -94,7 +85,6 @@ class _GrpcCall:
         address: str,
         through: str,
     ) -> None:
-        forks.watch(call)
         self._call = call
         self._responses = aiter(call)
         self._address = address

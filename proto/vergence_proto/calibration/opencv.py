@@ -18,7 +18,7 @@ from vergence_proto.types import Distortion, Intrinsics
 
 _MATRIX = ("M{}", "K{}", "cameraMatrix{}", "camera_matrix_{}", "CM{}")
 _COEFFICIENTS = ("D{}", "distCoeffs{}", "dist_coeffs_{}", "distortion_coefficients_{}")
-_COUNTS = (4, 5, 8)
+_COUNTS = (4, 5, 8, 12, 14)
 # A baseline in these units would be longer than any rig's in metres.
 _LONGEST_BASELINE_M = 5.0
 
@@ -59,14 +59,8 @@ def _rectified(file: Fields, size: Sequence[float], unit_m: float) -> Calibratio
 def _camera(file: Fields, number: str, size: Sequence[float]) -> Intrinsics:
     matrix = _named(file, _MATRIX, number, (3, 3))
     coefficients = _named(file, _COEFFICIENTS, number, None)
-    # OpenCV pads to 14 with zeros: thin prism (s1 to s4) and tilt (tx, ty).
-    count = next((count for count in _COUNTS if not coefficients[count:].any()), None)
-    if count is None:
-        raise BadCalibration(
-            f"{file.where}, D{number}: expected no thin prism and tilt coefficients, got "
-            f"{coefficients[8:].tolist()}; calibrate without CALIB_THIN_PRISM_MODEL and "
-            "CALIB_TILTED_MODEL"
-        )
+    # OpenCV pads to 14 with zeros.
+    count = next((count for count in _COUNTS if not coefficients[count:].any()), _COUNTS[-1])
     values = np.zeros(count)
     values[: min(count, coefficients.size)] = coefficients[:count]
     return intrinsics(

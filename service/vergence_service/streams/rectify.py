@@ -12,6 +12,11 @@ from vergence_proto.geometry import Matrix, Pose, RectifiedRig
 from vergence_proto.types import Distortion, Image, Intrinsics, Plane, StereoRig
 from vergence_service.streams.search_window import SearchReach, SearchWindow
 
+_WIDEST_VIEW_DEG = 110.0
+_KEPT_SHARE = 0.8  # of the least focal length: OpenCV's choice is kept down to this
+_LOOKS_AHEAD = 0.2  # cosine of the angle between an original and the rectified axis
+_ALONG_ROWS = 0.5  # share of the baseline that must lie along the rows: OpenCV turns it there
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Maps:
@@ -106,16 +111,16 @@ def _rectified_cameras(rig: StereoRig) -> _Cameras:
     if len(fisheye) > 1:
         raise BadCalibration("expected both cameras to be fisheye or neither, got one of each")
     projections, rotations = (_fisheye if fisheye.pop() else _pinhole)(rig)
-    (left_k, right_k) = (projection[:, :3] for projection in projections)
-    focal_px = right_k[0, 0]
-    baseline_m = -projections[1][0, 3] / focal_px
-    if not (np.isfinite([left_k, right_k]).all() and focal_px > 0 and left_k[1, 1] > 0):
+    if not np.isfinite(rotations).all():
         raise BadCalibration("the rig has no rectification; check distortion and left_from_right")
-    if not baseline_m > 0:
+    towards_left_m = rotations[1] @ rig.left_from_right.inverse().translation_m
+    baseline_m = -towards_left_m[0]
+    if not baseline_m > _ALONG_ROWS * np.linalg.norm(towards_left_m):
         raise BadCalibration(
             "expected the right camera to the right of the left one (left_from_right with a "
             f"translation mostly along +x), got {rig.left_from_right.translation_m.tolist()}"
         )
+    left_k, right_k = _useful(rig, rotations, [projection[:, :3] for projection in projections])
     rectified = RectifiedRig(
         rig.left.width,
         rig.left.height,
@@ -127,6 +132,32 @@ def _rectified_cameras(rig: StereoRig) -> _Cameras:
         float(baseline_m),
     )
     return _Cameras(rectified, rotations, [left_k, right_k])
+
+
+def _useful(rig: StereoRig, rotations: list[Matrix], intrinsics: list[Matrix]) -> list[Matrix]:
+    """Return the rectified intrinsics, or better ones if OpenCV's show too wide a view.
+
+    OpenCV fits the whole of a lens into the rectified image. A plane has room for less than 180
+    degrees, and the more it shows, the fewer pixels are left for what is ahead. So a rectified
+    image shows at most the angle below, or what it shows at the focal length of the original.
+    """
+    width, height = rig.left.width, rig.left.height
+    ahead_px = min(rig.left.fx, rig.left.fy, rig.right.fx, rig.right.fy)
+    least_px = min(ahead_px, width / 2 / np.tan(np.radians(_WIDEST_VIEW_DEG / 2)))
+    if np.isfinite(intrinsics).all() and all(
+        _KEPT_SHARE * least_px <= min(each[0, 0], each[1, 1]) for each in intrinsics
+    ):
+        return intrinsics
+    axes = [rotation[:, 2] for rotation in rotations]  # where the original cameras look
+    if min(axis[2] for axis in axes) < _LOOKS_AHEAD:
+        raise BadCalibration(
+            "expected two cameras that look into one direction, across the baseline; "
+            "check left_from_right"
+        )
+    x, y, _ = np.mean([axis / axis[2] for axis in axes], axis=0)
+    centre = (width - 1) / 2 - least_px * x, (height - 1) / 2 - least_px * y
+    matrix = np.array([[least_px, 0, centre[0]], [0, least_px, centre[1]], [0, 0, 1]])
+    return [matrix, matrix.copy()]
 
 
 def _left_maps(rig: StereoRig, cameras: _Cameras) -> _Maps:
