@@ -145,7 +145,7 @@ async def test_results_come_in_every_format_and_output() -> None:
         np.testing.assert_array_equal(arrays["depth"], depths[0])
         assert set(arrays) == {"disparity", "depth", "confidence"}
     assert zips["mp4"].headers["Content-Type"] == "video/mp4"
-    with av.open(io.BytesIO(zips["mp4"].content)) as film:
+    with av.open(io.BytesIO(zips["mp4"].content), "r") as film:
         assert film.streams.video[0].codec_context.name == "h264"  # every browser plays it
         assert sum(1 for _ in film.decode(video=0)) == len(exact)
 

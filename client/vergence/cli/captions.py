@@ -8,7 +8,11 @@ import cv2
 from vergence.cli.errors import CliError
 from vergence.cli.pictures import Row, sheet
 from vergence.cli.streaming import AnsweredFrame
-from vergence_proto.types import Origin, StereoRig
+from vergence_proto.geometry import RectifiedRig
+from vergence_proto.types import Origin, OutputFormat, StereoRig
+
+WITH_SIGMA = OutputFormat(sigma=True)
+"""What a server must return for pictures."""
 
 _SHEET_ROWS = 4
 _SHOWN_OF_A_CAMERA = (0, 30, 90, 270)
@@ -29,6 +33,7 @@ def row_of(answered: AnsweredFrame) -> Row:
         left=answered.source.frame.left,
         disparity_px=result.offset_px,
         truth_px=answered.source.truth_px,
+        sigma_px=result.sigma_px,
     )
 
 
@@ -48,7 +53,7 @@ def shown_in_sheet(count: int | None) -> list[int]:
     return sorted({round(row * (count - 1) / max(rows - 1, 1)) for row in range(rows)})
 
 
-def write_sheet(path: Path, title: str, rows: Sequence[Row]) -> None:
+def write_sheet(path: Path, title: str, rows: Sequence[Row], rig: RectifiedRig | None) -> None:
     """Write a sheet of rows as a picture. Raises CliError: the file cannot be written."""
-    if not cv2.imwrite(str(path), sheet(title, rows)):
+    if not cv2.imwrite(str(path), sheet(title, rows, rig=rig)):
         raise CliError(f"cannot write {path}")

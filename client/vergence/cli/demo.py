@@ -1,14 +1,15 @@
 """``vergence demo``: stream the bundled sequence through a server and draw a picture."""
 
 import time
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import aclosing
+from functools import partial
 from importlib import resources
 from pathlib import Path
 
 from rich.console import Console
 
-from vergence.cli.captions import row_of, shown_in_sheet, title_of, write_sheet
+from vergence.cli.captions import WITH_SIGMA, row_of, shown_in_sheet, title_of, write_sheet
 from vergence.cli.json_file import write_json
 from vergence.cli.local_server import server_for
 from vergence.cli.pictures import Row, Video
@@ -17,8 +18,9 @@ from vergence.cli.report import Report
 from vergence.cli.sources import source_at
 from vergence.cli.streaming import AnsweredFrame, every_frame
 from vergence.client import DepthClient
-from vergence_proto.datasets import SourceFrame, StereoSource
+from vergence_proto.datasets import SourceFrame
 from vergence_proto.film import CannotFilm
+from vergence_proto.geometry import RectifiedRig
 from vergence_proto.types import Delivery
 
 _FPS_UNKNOWN = 30.0
@@ -40,8 +42,9 @@ async def demo(
     async with (
         server_for(None, console) as server,
         DepthClient(server) as client,
-        client.open_session(source.rig, delivery=Delivery.EVERY) as session,
+        client.open_session(source.rig, delivery=Delivery.EVERY, output=WITH_SIGMA) as session,
     ):
+        rig = session.rig if source.metric else None
         title = title_of(source.name, source.rig, session.model.name)
         answers: list[AnsweredFrame] = []
         with progress_bar(console) as progress:
@@ -54,7 +57,8 @@ async def demo(
             report.seconds = time.monotonic() - started_s
     for answered in answers:
         report.add(answered.latency_s, answered.result.timings.model_s, answered.accuracy())
-    _draw(source, title, [row_of(answered) for answered in answers], out, console)
+    video = partial(Video, title=title, fps=source.fps or _FPS_UNKNOWN, rig=rig)
+    _draw(title, [row_of(answered) for answered in answers], rig, video, out, console)
     console.print(report.as_table(title))
     if json is not None:
         write_json(json, report.as_json())
@@ -66,13 +70,18 @@ async def _as_read(frames: Sequence[SourceFrame]) -> AsyncIterator[tuple[int, So
 
 
 def _draw(
-    source: StereoSource, title: str, rows: Sequence[Row], out: Path, console: Console
+    title: str,
+    rows: Sequence[Row],
+    rig: RectifiedRig | None,
+    make_video: Callable[[Path, Row], Video],
+    out: Path,
+    console: Console,
 ) -> None:
     out.mkdir(parents=True, exist_ok=True)
-    write_sheet(out / "demo.png", title, [rows[index] for index in shown_in_sheet(len(rows))])
+    write_sheet(out / "demo.png", title, [rows[index] for index in shown_in_sheet(len(rows))], rig)
     console.print(f"picture  {out / 'demo.png'}")
     try:
-        with Video(out / "demo.mp4", rows[0], title=title, fps=source.fps or _FPS_UNKNOWN) as video:
+        with make_video(out / "demo.mp4", rows[0]) as video:
             for row in rows:
                 video.add(row)
     except CannotFilm as error:

@@ -11,7 +11,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import TaskID
 
-from vergence.cli.captions import row_of, shown_in_sheet, title_of, write_sheet
+from vergence.cli.captions import WITH_SIGMA, row_of, shown_in_sheet, title_of, write_sheet
 from vergence.cli.errors import CliError
 from vergence.cli.json_file import write_json
 from vergence.cli.local_server import server_for
@@ -50,6 +50,7 @@ async def run(
     """
     footage = footage_at(sources, calibration)
     pace = _pace(rate, footage)
+    drawn = footage.loose if pictures is None else pictures
     count = frames if footage.count is None else min(frames or footage.count, footage.count)
     directory = out or Path("vergence-run") / footage.name
     results = _Results(directory, footage, kept=shown_in_sheet(count))
@@ -62,17 +63,19 @@ async def run(
         client.open_session(
             footage.rig,
             delivery=pace.delivery,
+            output=WITH_SIGMA if drawn else None,
             iterations=iterations,
             cold_iterations=iterations if footage.alone else 0,
         ) as session,
     ):
         title = title_of(footage.name, footage.rig, session.model.name)
+        rig = session.rig if footage.metric else None
         try:
             report = await _stream(session, footage, pace, count, results, console)
         except DatasetError as error:  # a file in the middle of the sequence
             raise CliError(str(error), exit_code=2) from None
-    if results.rows and (footage.loose if pictures is None else pictures):
-        write_sheet(directory / "sheet.png", title, results.rows)
+    if drawn and results.rows:
+        write_sheet(directory / "sheet.png", title, results.rows, rig)
         console.print(f"picture    {directory / 'sheet.png'}")
     console.print(f"disparity  {directory}")
     if footage.has_depth:
