@@ -4,6 +4,7 @@ import asyncio
 
 import pytest
 
+from vergence_proto.codec import ReceivedFrame
 from vergence_proto.errors import FrameOutOfOrder
 from vergence_proto.types import Delivery
 from vergence_proto.v1 import depth_pb2 as pb
@@ -12,7 +13,7 @@ from vergence_service.transports.mailbox import Mailbox, QueuedFrame
 
 def queued(frame_id: int) -> QueuedFrame:
     frame = pb.Frame(frame_id=frame_id, capture_ns=frame_id * 1000)
-    return QueuedFrame(frame, arrived_s=float(frame_id))
+    return QueuedFrame(ReceivedFrame.of(frame), arrived_s=float(frame_id))
 
 
 async def test_of_live_frames_the_newest_is_taken_and_each_other_given_back() -> None:
@@ -21,7 +22,7 @@ async def test_of_live_frames_the_newest_is_taken_and_each_other_given_back() ->
     assert [one and one.frame_id for one in displaced] == [None, 1, 2, 3]
     taken = await mailbox.take()
     assert taken is not None
-    assert taken.frame.capture_ns == 4000
+    assert taken.frame.fields.capture_ns == 4000
 
 
 async def test_an_older_frame_displaces_nothing() -> None:

@@ -6,6 +6,8 @@ what came. The layers below the codec do not check again.
 """
 
 from vergence_proto.codec.frames import (
+    check_frame,
+    decode_frame,
     delivery_from_proto,
     delivery_to_proto,
     disparity_from_proto,
@@ -23,6 +25,13 @@ from vergence_proto.codec.frames import (
 )
 from vergence_proto.codec.images import image_from_proto, image_to_wire
 from vergence_proto.codec.planes import plane_from_proto, plane_to_proto
+from vergence_proto.codec.requests import (
+    ReceivedFrame,
+    Request,
+    read_frame,
+    read_request,
+    read_small,
+)
 from vergence_proto.codec.rigs import (
     axes_from_proto,
     axes_to_proto,
@@ -38,8 +47,12 @@ from vergence_proto.codec.rigs import (
 from vergence_proto.codec.status import error_from_status, error_to_status
 
 __all__ = [
+    "ReceivedFrame",
+    "Request",
     "axes_from_proto",
     "axes_to_proto",
+    "check_frame",
+    "decode_frame",
     "delivery_from_proto",
     "delivery_to_proto",
     "disparity_from_proto",
@@ -62,6 +75,9 @@ __all__ = [
     "pose_sample_from_proto",
     "pose_sample_to_proto",
     "pose_to_proto",
+    "read_frame",
+    "read_request",
+    "read_small",
     "rectified_rig_from_proto",
     "rectified_rig_to_proto",
     "rig_from_proto",

@@ -18,6 +18,7 @@ from vergence_proto.codec.planes import (
     plane_from_proto,
     plane_to_proto,
 )
+from vergence_proto.codec.requests import ReceivedFrame, ReceivedImage
 from vergence_proto.codec.rigs import (
     pose_from_proto,
     pose_sample_from_proto,
@@ -40,6 +41,9 @@ from vergence_proto.types import (
 from vergence_proto.v1 import depth_pb2 as pb
 
 _MICROSECONDS = 1e6
+# The largest image file of a size: a PNG with alpha and 16 bits per channel, and its metadata.
+_BYTES_A_PIXEL = 8
+_BYTES_BESIDE_PIXELS = 1 << 18
 _LARGEST_UINT32 = 2**32 - 1
 
 
@@ -71,22 +75,30 @@ def frame_to_request(
 def frame_from_proto(
     message: pb.Frame, *, size: tuple[int, int] | None = None, max_bytes: int | None = None
 ) -> StereoFrame:
-    """Decode both images and the pose.
+    """Check and decode a frame, as :func:`check_frame` and :func:`decode_frame` do."""
+    received = ReceivedFrame.of(message)
+    check_frame(received, size=size, max_bytes=max_bytes)
+    return decode_frame(received)
+
+
+def check_frame(
+    received: ReceivedFrame, *, size: tuple[int, int] | None = None, max_bytes: int | None = None
+) -> None:
+    """Check a frame without decoding it.
 
     ``size`` is the required (width, height) of both images, ``max_bytes`` the limit on the bytes of
     both together.
 
-    Raises FrameTooLarge: the images have more than ``max_bytes``.
-    Raises BadShape: the frame id is 0, the sizes differ from ``size`` or from each other (no image
-    is decoded then), or the maximum age is negative or not finite.
-    Raises BadImage: an image is not whole, or not of the stated encoding and size.
-    Raises BadPose: a valid part of the pose is not finite, or its quaternion is not of unit length.
+    Raises FrameTooLarge: the images have more than ``max_bytes``, or far more than their pixels.
+    Raises BadShape: the frame id is 0, the sizes differ from ``size`` or from each other, or the
+    maximum age is negative or not finite.
     """
+    message = received.fields
     if message.frame_id == 0:
         raise BadShape("expected a frame_id from 1 upwards, got 0")
     if message.HasField("max_age_s") and not 0 <= message.max_age_s < math.inf:
         raise BadShape(f"expected a max_age_s from 0 upwards, got {message.max_age_s}")
-    left, right = message.left, message.right
+    left, right = received.left.header, received.right.header
     if (left.width, left.height) != (right.width, right.height):
         raise BadShape(
             f"both images must have one size, got left {left.width}x{left.height} "
@@ -97,17 +109,31 @@ def frame_from_proto(
             f"expected images of {size[0]}x{size[1]}, as the stream was opened with, "
             f"got {left.width}x{left.height}"
         )
-    left_data, right_data = left.data, right.data  # read once, because every access copies
-    if max_bytes is not None and len(left_data) + len(right_data) > max_bytes:
+    left_bytes, right_bytes = len(received.left.data), len(received.right.data)
+    most = _BYTES_BESIDE_PIXELS + _BYTES_A_PIXEL * left.width * left.height
+    if max_bytes is not None and left_bytes + right_bytes > max_bytes:
         raise FrameTooLarge(
-            f"expected a frame of at most {max_bytes} bytes, got {len(left_data)} and "
-            f"{len(right_data)}"
+            f"expected a frame of at most {max_bytes} bytes, got {left_bytes} and {right_bytes}"
         )
+    if max(left_bytes, right_bytes) > most:
+        raise FrameTooLarge(
+            f"expected at most {most} bytes for {left.width}x{left.height} pixels, got "
+            f"{left_bytes} and {right_bytes}"
+        )
+
+
+def decode_frame(received: ReceivedFrame) -> StereoFrame:
+    """Decode both images and the pose of a frame that :func:`check_frame` accepts.
+
+    Raises BadImage: an image is not whole, or not of the stated encoding and size.
+    Raises BadPose: a valid part of the pose is not finite, or its quaternion is not of unit length.
+    """
+    message = received.fields
     return StereoFrame(
         frame_id=message.frame_id,
         capture_ns=message.capture_ns,
-        left=_side(left, left_data, "left"),
-        right=_side(right, right_data, "right"),
+        left=_side(received.left, "left"),
+        right=_side(received.right, "right"),
         pose=pose_sample_from_proto(message.pose) if message.HasField("pose") else None,
     )
 
@@ -254,9 +280,9 @@ def error_from_frame_error(message: pb.FrameError) -> DepthError:
     return error_from_wire(message.reason, message.message, retry_after_s)
 
 
-def _side(message: pb.Image, data: bytes, side: str) -> Image:
+def _side(received: ReceivedImage, side: str) -> Image:
     try:
-        return image_from_proto(message, data)
+        return image_from_proto(received.header, received.data)
     except BadImage as error:
         raise BadImage(f"{side} image: {error}") from None
 

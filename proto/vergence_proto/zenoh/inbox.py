@@ -3,30 +3,32 @@
 import asyncio
 import threading
 from collections import deque
+from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 
 import zenoh
 from google.protobuf.message import DecodeError, Message
 from google.rpc import status_pb2
 
-from vergence_proto.errors import Quota
+from vergence_proto.codec import ReceivedFrame, read_frame, read_small
+from vergence_proto.errors import DepthError, Quota
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.zenoh.keys import encoding_of
 
 # All messages except images and maps are small, and about one of them comes with each of those.
 _SMALL_MESSAGES = 256
 
-_TYPES: dict[str, type[Message]] = {
-    encoding_of(kind()): kind
-    for kind in (
-        pb.Frame,
-        pb.Ping,
-        pb.Reset,
-        pb.End,
-        pb.DisparityMap,
-        pb.StreamDepthResponse,
-        status_pb2.Status,
-    )
+Received = Message | ReceivedFrame
+
+# Messages to the server are read within limits; those to the client come from a server it chose.
+_READERS: dict[str, Callable[[bytes], Received]] = {
+    encoding_of(pb.Frame()): read_frame,
+    **{encoding_of(kind()): partial(read_small, kind) for kind in (pb.Ping, pb.Reset, pb.End)},
+    **{
+        encoding_of(kind()): kind.FromString
+        for kind in (pb.DisparityMap, pb.StreamDepthResponse, status_pb2.Status)
+    },
 }
 
 
@@ -86,7 +88,7 @@ class Inbox:
         self._end = self._end or error
         self._arrived.set()
 
-    async def take(self) -> Message:
+    async def take(self) -> Received:
         """Remove and return the oldest message; wait until there is one.
 
         A message that does not decode is discarded, as if the network had lost it.
@@ -98,8 +100,8 @@ class Inbox:
             if isinstance(payload, Message):
                 return payload
             if payload is not None:
-                with suppress(DecodeError, KeyError):
-                    return _TYPES[encoding].FromString(payload.to_bytes())
+                with suppress(DecodeError, DepthError, KeyError):
+                    return _READERS[encoding](payload.to_bytes())
             elif self._end is not None:
                 raise self._end
             else:

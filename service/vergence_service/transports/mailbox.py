@@ -4,16 +4,16 @@ import asyncio
 from collections import deque
 from dataclasses import dataclass, replace
 
+from vergence_proto.codec import ReceivedFrame
 from vergence_proto.errors import FrameOutOfOrder
 from vergence_proto.types import Delivery
-from vergence_proto.v1 import depth_pb2 as pb
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class QueuedFrame:
     """A frame as it arrived."""
 
-    frame: pb.Frame
+    frame: ReceivedFrame
     arrived_s: float
     reset_before: bool = False  # the client asked for a reset just before this frame
 

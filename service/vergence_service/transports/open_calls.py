@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
 
+from vergence_proto.codec import Request
 from vergence_proto.errors import Draining
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.streams.engine import DepthEngine
@@ -24,7 +25,7 @@ class OpenCalls:
 
     def make(
         self,
-        requests: AsyncIterator[pb.StreamDepthRequest],
+        requests: AsyncIterator[Request],
         write: Callable[[pb.StreamDepthResponse], Awaitable[None]],
         *,
         client: str,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from vergence_proto import codec
-from vergence_proto.errors import BadShape, DepthError, StreamExists, UnknownStream
+from vergence_proto.errors import DepthError, StreamExists, UnknownStream
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.stream import Notice, Stream, StreamConfig
@@ -39,7 +39,7 @@ class DepthCall:
     def __init__(
         self,
         engine: DepthEngine,
-        requests: AsyncIterator[pb.StreamDepthRequest],
+        requests: AsyncIterator[codec.Request],
         write: Callable[[pb.StreamDepthResponse], Awaitable[None]],
         *,
         client: str,
@@ -147,10 +147,9 @@ class DepthCall:
             raise ClientLost(f"the client did not read an answer for {patience_s:.0f} s") from None
 
     async def _open(self) -> tuple[Stream, bool]:
-        first = await anext(aiter(self._requests), None)
-        if first is None or not first.HasField("open"):
+        request = await anext(aiter(self._requests), None)
+        if not isinstance(request, pb.OpenStream):
             raise UnknownStream("the first message of a call must open or resume a stream")
-        request = first.open
         config = StreamConfig(
             rig=codec.rig_from_proto(request.rig),
             axes=codec.axes_from_proto(request.axes),
@@ -192,31 +191,33 @@ class DepthCall:
         try:
             async for request in self._requests:
                 arrived_s = self._heard_s = self._clock()
-                match request.WhichOneof("message"):
-                    case "frame":
-                        await self._receive(stream, mailbox, request.frame, arrived_s)
-                    case "ping":
+                match request:
+                    case codec.ReceivedFrame():
+                        await self._receive(stream, mailbox, request, arrived_s)
+                    case pb.Ping():
                         self._pings = True
-                        await self._outbox.put_pong(request.ping, arrived_s=arrived_s)
-                    case "reset":
+                        await self._outbox.put_pong(request, arrived_s=arrived_s)
+                    case pb.Reset():
                         mailbox.reset()
-                    case "end":
+                    case pb.End():
                         self._client_is_done = True
                         return
-                    case "open":
+                    case pb.OpenStream():
                         self.end(StreamExists("this call has already opened its stream"))
-                    case None:
-                        self.end(BadShape("expected one of the messages of depth.proto, got none"))
         except DepthError as error:  # the bytes are not a message
             self.end(error)
         finally:
             await mailbox.finish()
 
     async def _receive(
-        self, stream: Stream, mailbox: Mailbox, frame: pb.Frame, arrived_s: float
+        self, stream: Stream, mailbox: Mailbox, frame: codec.ReceivedFrame, arrived_s: float
     ) -> None:
         self._owed += 1
+        rig = stream.rectifier.rig
         try:
+            codec.check_frame(
+                frame, size=(rig.width, rig.height), max_bytes=self._limits.max_frame_bytes
+            )
             displaced = await mailbox.put(QueuedFrame(frame, arrived_s))
         except DepthError as error:
             self._engine.count_failed(stream, error)
@@ -233,26 +234,20 @@ class DepthCall:
         await self._outbox.put(pb.StreamDepthResponse(frames_dropped=dropped))
 
     async def _step(self, stream: Stream, mailbox: Mailbox) -> None:
-        rig = stream.rectifier.rig
         while True:
             await self._outbox.reserve_map()
             queued = await mailbox.take()
             if queued is None:
                 return
-            frame = queued.frame
+            fields = queued.frame.fields
             try:
                 if queued.reset_before:
                     await self._engine.reset(stream.stream_id)
                 stepped = await self._engine.step(
                     stream.stream_id,
-                    partial(
-                        codec.frame_from_proto,
-                        frame,
-                        size=(rig.width, rig.height),
-                        max_bytes=self._limits.max_frame_bytes,
-                    ),
+                    partial(codec.decode_frame, queued.frame),
                     arrived_s=queued.arrived_s,
-                    max_age_s=frame.max_age_s if frame.HasField("max_age_s") else None,
+                    max_age_s=fields.max_age_s if fields.HasField("max_age_s") else None,
                 )
             except DepthError as error:
                 self._outbox.release_map()

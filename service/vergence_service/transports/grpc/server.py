@@ -2,23 +2,23 @@
 
 import logging
 from collections import Counter
-from collections.abc import AsyncIterator
-from typing import Self
+from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import Any, Self
 from urllib.parse import unquote
 
 import grpc
-from google.protobuf.message import DecodeError
+from google.protobuf.message import Message
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
-from vergence_proto.errors import BadShape
+from vergence_proto.codec import Request, read_request, read_small
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_proto.v1 import depth_pb2_grpc
 from vergence_service.transports.addresses import format_address, listening_socket
 from vergence_service.transports.errors import PortTaken
 from vergence_service.transports.grpc.deadlines import FirstMessageDeadline
 from vergence_service.transports.grpc.errors import Context, errors_as_status
 from vergence_service.transports.grpc.hang_up import hang_up
+from vergence_service.transports.grpc.small_requests import SmallRequests
 from vergence_service.transports.open_calls import OpenCalls
 from vergence_service.transports.stream_call import ClientLost
 from vergence_service.transports.unary import UnaryMethods
@@ -47,14 +47,12 @@ _KEEPALIVE = (
 )
 
 
-async def _messages(
-    requests: AsyncIterator[pb.StreamDepthRequest],
-) -> AsyncIterator[pb.StreamDepthRequest]:
-    try:
-        async for request in requests:
-            yield request
-    except DecodeError:
-        raise BadShape("expected messages of vergence.v1, got other bytes") from None
+async def _requests(messages: AsyncIterator[bytes]) -> AsyncIterator[Request]:
+    async for message in messages:
+        yield read_request(message)
+
+
+_Answer = tuple[type[Message], Callable[[Any], Awaitable[Message]]]
 
 
 def _host_of(peer: str) -> str:
@@ -63,21 +61,29 @@ def _host_of(peer: str) -> str:
     return address.rpartition(":")[0].strip("[]")
 
 
-class DepthServicer(depth_pb2_grpc.DepthServiceServicer):
-    """Translates each call to a call of the engine."""
+class DepthServicer:
+    """Translates each call to a call of the engine. It reads requests from bytes, within limits."""
 
     def __init__(self, unary: UnaryMethods, calls: OpenCalls) -> None:
-        self._unary = unary
         self.calls = calls
         self._by_peer: Counter[str] = Counter()  # open calls of each connection
+        answers: dict[str, _Answer] = {
+            "GetServerInfo": (pb.GetServerInfoRequest, unary.server_info),
+            "GetStream": (pb.GetStreamRequest, unary.stream),
+            "ResetStream": (pb.ResetStreamRequest, unary.reset),
+            "CloseStream": (pb.CloseStreamRequest, unary.close),
+        }
+        self.handlers: dict[str, grpc.RpcMethodHandler[Any, Any]] = {
+            "StreamDepth": grpc.stream_stream_rpc_method_handler(
+                self._stream_depth, response_serializer=pb.StreamDepthResponse.SerializeToString
+            ),
+            **{name: _unary(*answer) for name, answer in answers.items()},
+        }
 
-    async def StreamDepth(  # noqa: N802 -- the wire's name
-        self, request_iterator: AsyncIterator[pb.StreamDepthRequest], context: Context
-    ) -> None:
+    async def _stream_depth(self, messages: AsyncIterator[bytes], context: Context) -> None:
         async with errors_as_status(context):
-            requests = _messages(request_iterator)
             peer = context.peer()
-            call = self.calls.make(requests, context.write, client=_host_of(peer))
+            call = self.calls.make(_requests(messages), context.write, client=_host_of(peer))
             self._by_peer[peer] += 1
             try:
                 await self.calls.run(call)
@@ -89,29 +95,15 @@ class DepthServicer(depth_pb2_grpc.DepthServiceServicer):
                 if not self._by_peer[peer]:
                     del self._by_peer[peer]
 
-    async def GetServerInfo(  # noqa: N802
-        self, request: pb.GetServerInfoRequest, context: Context
-    ) -> pb.GetServerInfoResponse:
-        async with errors_as_status(context):
-            return await self._unary.server_info(request)
 
-    async def GetStream(  # noqa: N802
-        self, request: pb.GetStreamRequest, context: Context
-    ) -> pb.GetStreamResponse:
+def _unary(
+    question: type[Message], answer: Callable[[Any], Awaitable[Message]]
+) -> "grpc.RpcMethodHandler[Any, Any]":
+    async def handle(request: bytes, context: Context) -> bytes:
         async with errors_as_status(context):
-            return await self._unary.stream(request)
+            return (await answer(read_small(question, request))).SerializeToString()
 
-    async def ResetStream(  # noqa: N802
-        self, request: pb.ResetStreamRequest, context: Context
-    ) -> pb.ResetStreamResponse:
-        async with errors_as_status(context):
-            return await self._unary.reset(request)
-
-    async def CloseStream(  # noqa: N802
-        self, request: pb.CloseStreamRequest, context: Context
-    ) -> pb.CloseStreamResponse:
-        async with errors_as_status(context):
-            return await self._unary.close(request)
+    return grpc.unary_unary_rpc_method_handler(handle)
 
 
 class GrpcServer:
@@ -140,7 +132,7 @@ class GrpcServer:
 
     async def __aenter__(self) -> Self:
         self._server = grpc.aio.server(
-            interceptors=[FirstMessageDeadline(self._first_message_s)],
+            interceptors=[FirstMessageDeadline(self._first_message_s), SmallRequests()],
             maximum_concurrent_rpcs=self._max_connections + _MORE_CALLS,
             options=[
                 # On by default, two servers would share the port and split streams silently.
@@ -153,7 +145,9 @@ class GrpcServer:
                 *_KEEPALIVE,
             ],
         )
-        depth_pb2_grpc.add_DepthServiceServicer_to_server(self._servicer, self._server)
+        self._server.add_generic_rpc_handlers(
+            [grpc.method_handlers_generic_handler(_SERVICE, self._servicer.handlers)]
+        )
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
         reflection.enable_server_reflection(
             [_SERVICE, health.SERVICE_NAME, reflection.SERVICE_NAME], self._server

@@ -10,9 +10,10 @@ from typing import Any
 
 from fastapi import APIRouter, Path, Request, Response
 from fastapi.responses import StreamingResponse
-from google.protobuf.message import DecodeError, Message
+from google.protobuf.message import Message
 
 from vergence_proto import codec
+from vergence_proto.codec.requests import MAX_SMALL_BYTES
 from vergence_proto.errors import BadShape, DepthError, FrameTooLarge, ModelFailed, UnknownStream
 from vergence_proto.http_records import (
     CALL_ID_HEADER,
@@ -29,6 +30,8 @@ from vergence_service.transports.open_calls import OpenCalls
 from vergence_service.transports.stream_call import ClientLost
 from vergence_service.transports.unary import UnaryMethods
 
+_BESIDE_IMAGES = 4096  # the fields of a frame that are no images
+
 _BODY: dict[str, Any] = {
     "requestBody": {
         "required": True,
@@ -43,15 +46,15 @@ def stream_routes(
 ) -> APIRouter:
     """Make the routes. A body that comes too slowly is refused."""
 
-    async def read(request: Request, kind: type[Any]) -> Any:
-        body = body_of(request, patience_s=patience_s, min_bytes_per_s=min_bytes_per_s)
-        return await _message(body, kind, calls)
+    async def body(request: Request, limit: int) -> memoryview:
+        chunks = body_of(request, patience_s=patience_s, min_bytes_per_s=min_bytes_per_s)
+        return await _collected(chunks, limit)
 
     def method(
         question: type[Any], answer: Callable[[Any], Coroutine[Any, Any, Message]]
     ) -> _Method:
         async def ask(request: Request) -> Message:
-            return await answer(await read(request, question))
+            return await answer(codec.read_small(question, await body(request, MAX_SMALL_BYTES)))
 
         return ask
 
@@ -73,7 +76,7 @@ def stream_routes(
     async def open_stream(request: Request) -> StreamingResponse:
         """Open or resume a stream with a StreamDepthRequest. The answers come as records."""
         call = _HttpCall(calls, client=client_of(request))
-        first = await call.begin(await read(request, pb.StreamDepthRequest))
+        first = await call.begin(codec.read_request(await body(request, MAX_SMALL_BYTES)))
         open_calls[call.call_id] = call
 
         async def records() -> AsyncIterator[bytes]:
@@ -96,7 +99,8 @@ def stream_routes(
             raise UnknownStream("no open call has this id; open or resume the stream")
         call = open_calls[call_id]
         try:
-            await call.put(await read(request, pb.StreamDepthRequest))
+            message = await body(request, calls.limits.max_frame_bytes + _BESIDE_IMAGES)
+            await call.put(codec.read_request(message))
         except DepthError as error:
             call.end(error)  # the client would wait for an answer to this message for ever
             raise
@@ -130,13 +134,13 @@ class _HttpCall:
         self._client = client
         self._calls = calls
         # Room for one each: the faster side waits for the slower, as on a full connection.
-        self._incoming: asyncio.Queue[pb.StreamDepthRequest] = asyncio.Queue(1)
+        self._incoming: asyncio.Queue[codec.Request] = asyncio.Queue(1)
         self._outgoing: asyncio.Queue[bytes | None] = asyncio.Queue(1)  # None: nothing follows
         self._ended = asyncio.Event()
         self._opened = False
         self._refusal: DepthError | None = None  # the error of the opening
 
-    async def begin(self, opening: pb.StreamDepthRequest) -> bytes:
+    async def begin(self, opening: codec.Request) -> bytes:
         """Start the call; return the first record of its answer. Raises the opening's error."""
         self._call = self._calls.make(self._requests(opening), self._write, client=self._client)
         self._task = asyncio.create_task(self._run(), name="HTTP call")
@@ -146,7 +150,7 @@ class _HttpCall:
         assert first is not None  # the opening is answered before a client can be lost
         return first
 
-    async def put(self, message: pb.StreamDepthRequest) -> None:
+    async def put(self, message: codec.Request) -> None:
         ended = asyncio.create_task(self._ended.wait())
         put = asyncio.create_task(self._incoming.put(message))
         try:
@@ -193,9 +197,7 @@ class _HttpCall:
             self._refusal = error
         return codec.error_to_frame_error(0, error).SerializeToString()
 
-    async def _requests(
-        self, opening: pb.StreamDepthRequest
-    ) -> AsyncIterator[pb.StreamDepthRequest]:
+    async def _requests(self, opening: codec.Request) -> AsyncIterator[codec.Request]:
         yield opening
         while True:
             yield await self._incoming.get()
@@ -205,18 +207,11 @@ class _HttpCall:
         await self._outgoing.put(pack_record(RecordKind.MESSAGE, response.SerializeToString()))
 
 
-async def _message(chunks: AsyncIterator[bytes], kind: type[Any], calls: OpenCalls) -> Any:
-    """Read the body as a message of ``kind``.
-
-    Raises FrameTooLarge if it is too long, and BadShape if it is another message.
-    """
-    limit = calls.limits.max_frame_bytes
+async def _collected(chunks: AsyncIterator[bytes], limit: int) -> memoryview:
+    """Collect the body of a request. Raises FrameTooLarge if it has more than ``limit`` bytes."""
     body = bytearray()
     async for chunk in chunks:
         body += chunk
-        if len(body) > limit + 4096:  # room for the fields beside the images
+        if len(body) > limit:
             raise FrameTooLarge(f"expected a message of at most {limit} bytes")
-    try:
-        return kind.FromString(bytes(body))
-    except DecodeError:
-        raise BadShape(f"expected a {kind.DESCRIPTOR.name} as {PROTOBUF_TYPE}") from None
+    return memoryview(body)

@@ -7,6 +7,7 @@ import zenoh
 from google.protobuf.message import Message
 from google.rpc import status_pb2
 
+from vergence_proto.codec import ReceivedFrame, Request
 from vergence_proto.errors import Quota
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.zenoh.inbox import Inbox
@@ -73,8 +74,8 @@ class ZenohCall:
         elif isinstance(end, status_pb2.Status):
             await self._peer.refuse(self._query, end)
 
-    async def _requests(self) -> AsyncIterator[pb.StreamDepthRequest]:
-        yield pb.StreamDepthRequest(open=self._opening)
+    async def _requests(self) -> AsyncIterator[Request]:
+        yield self._opening
         while True:
             try:
                 message = await self._inbox.take()
@@ -82,15 +83,11 @@ class ZenohCall:
                 self._call.end(error)
                 return
             match message:
-                case pb.Frame():
+                case ReceivedFrame():
                     await self._note(message.frame_id)
-                    yield pb.StreamDepthRequest(frame=message)
-                case pb.Ping():
-                    yield pb.StreamDepthRequest(ping=message)
-                case pb.Reset():
-                    yield pb.StreamDepthRequest(reset=message)
-                case pb.End():
-                    yield pb.StreamDepthRequest(end=message)
+                    yield message
+                case pb.Ping() | pb.Reset() | pb.End():
+                    yield message
 
     async def _note(self, frame_id: int) -> None:
         last = self._last_frame_id

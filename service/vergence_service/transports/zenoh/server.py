@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any, Self, TypeVar
 
 import zenoh
-from google.protobuf.message import DecodeError, Message
+from google.protobuf.message import Message
 
-from vergence_proto.errors import BadShape
+from vergence_proto.codec import read_small
+from vergence_proto.errors import BadShape, DepthError
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.zenoh.keys import ANY, OPEN, UNARY_KEYS, StreamKeys, query_key, server_key
 from vergence_proto.zenoh.session import ZenohSession, make_config, reason_of
@@ -129,7 +130,7 @@ class ZenohServer:
         with query:  # Zenoh ends the query at the latest when the call ends
             try:
                 opening = _read(query, pb.OpenStream)
-            except BadShape as error:
+            except DepthError as error:
                 await self._peer.refuse(query, status_of(error))
                 return
             call = ZenohCall(
@@ -166,8 +167,5 @@ class ZenohServer:
 
 
 def _read(query: zenoh.Query, kind: type[Question]) -> Question:
-    """Read the payload of a query. Raises BadShape if it is not a message of ``kind``."""
-    try:
-        return kind.FromString(query.payload.to_bytes() if query.payload else b"")
-    except DecodeError:
-        raise BadShape(f"expected a {kind.DESCRIPTOR.full_name}, got other bytes") from None
+    """Read the payload of a query. Raises BadShape and FrameTooLarge."""
+    return read_small(kind, query.payload.to_bytes() if query.payload else b"")
