@@ -49,6 +49,9 @@ class Metrics:
         self.state_bytes = Gauge(
             "vergence_state_bytes", "Memory reserved for recurrent states", registry=registry
         )
+        self.pairs = Gauge(
+            "vergence_pairs", "Single pairs that wait or are stepped", registry=registry
+        )
         self.sequences = Gauge(
             "vergence_sequences",
             "Accepted sequences that wait or run",

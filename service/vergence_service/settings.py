@@ -155,6 +155,9 @@ class LimitSettings(_Section):
     min_kib_per_s: PositiveFloat = Field(
         default=16.0, description="slowest upload and download, in KiB per second"
     )
+    pairs: PositiveInt = Field(
+        default=8, description="most single pairs that wait or are stepped; one is stepped at once"
+    )
     streams_per_client: PositiveInt | None = Field(
         default=None, description="most open streams of one address, over gRPC and HTTP"
     )

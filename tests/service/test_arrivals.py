@@ -103,6 +103,23 @@ async def test_a_closed_stream_is_waited_for_no_longer() -> None:
     assert timings.queue_s == 0
 
 
+async def test_the_last_lane_is_kept_for_live_streams() -> None:
+    clock, model = ManualClock(), RecallModel(max_concurrent_steps=2)
+    async with make_batcher(model, clock=clock) as batcher:
+        await live(batcher)
+        await asyncio.to_thread(model.wait_until_entered)
+        model.batches.clear()
+        clock.advance(0.5)
+        with model.busy():
+            others = [asyncio.create_task(batcher.step(make_step(OTHER))) for _ in range(2)]
+            await asyncio.to_thread(model.wait_until_entered)
+            await turns()  # a step that may start has started by now
+            assert model.batches == [1]
+            urgent = asyncio.create_task(live(batcher))
+            await asyncio.to_thread(model.wait_until_entered)
+        await asyncio.wait_for(asyncio.gather(urgent, *others), PATIENCE_S)
+
+
 async def test_a_step_that_fits_into_the_gap_is_taken_at_once() -> None:
     clock = ManualClock()
     async with make_batcher(TimedModel(clock), clock=clock) as batcher:

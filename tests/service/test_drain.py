@@ -17,15 +17,20 @@ import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from tests.support.frames import frame_message, make_frame, open_message
-from tests.support.models import RecallModel
+from tests.support.http import ended, http_to, submit
+from tests.support.models import PacedModel, RecallModel
+from tests.support.polling import eventually_true
+from tests.support.sequences import make_frames, sequence_files, zip_bytes
 from tests.support.server import RawCall, connected, raw_stream, running_server
 from tests.support.status import reason_of
 from tests.support.weights_copy import WEIGHTS
 from vergence_proto.v1 import depth_pb2 as pb
+from vergence_proto.v1 import depth_pb2_grpc
 from vergence_service.app.server import Running, drain, serve
 from vergence_service.settings import load_settings
 from vergence_service.transports.errors import PortTaken
 
+REPOSITORY = Path(__file__).parents[2]
 SERVING = health_pb2.HealthCheckResponse.SERVING
 NOT_SERVING = health_pb2.HealthCheckResponse.NOT_SERVING
 
@@ -151,6 +156,57 @@ def test_the_process_tells_its_addresses_and_ends_cleanly_on_a_signal(
         assert process.wait(timeout=20) == 0
 
 
+async def test_a_process_ends_in_time_whatever_its_threads_do(tmp_path: Path) -> None:
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "tests.support.slow_server", "600"),
+        cwd=REPOSITORY,
+        env={
+            **os.environ,
+            "VERGENCE_SERVER__DRAIN_S": "0.5",
+            "VERGENCE_BATCH__DIRECTORY": str(tmp_path),
+        },
+        stdout=asyncio.subprocess.PIPE,
+    )
+    try:
+        assert process.stdout is not None
+        _, address, _ = (await process.stdout.readline()).decode().split()
+        async with grpc.aio.insecure_channel(address.removeprefix("grpc=")) as channel:
+            call = RawCall(depth_pb2_grpc.DepthServiceStub(channel).StreamDepth())
+            await call.ask(open_message("mine"))
+            await call.send(frame_message(make_frame(1)))  # ten minutes in the model
+            await call.ask(pb.StreamDepthRequest(ping=pb.Ping()))
+            process.send_signal(signal.SIGTERM)
+            notice = await call.receive()
+            assert notice is not None
+            assert notice.notice.kind == pb.NOTICE_KIND_DRAINING
+            assert await asyncio.wait_for(process.wait(), 30) == 0
+    finally:
+        if process.returncode is None:
+            process.kill()
+            await process.wait()
+
+
+async def test_a_job_keeps_its_progress_when_the_server_drains(tmp_path: Path) -> None:
+    flags: dict[str, Any] = {"batch__directory": tmp_path, "batch__checkpoint_s": 3600}
+    archive = zip_bytes(sequence_files(make_frames(40)))
+    async with (
+        running_server(PacedModel(0.05), **flags) as server,
+        http_to(server) as http,
+    ):
+        job_id = (await submit(http, archive))["id"]
+
+        async def has_begun() -> bool:
+            return bool((await http.get(f"/v1/sequences/{job_id}")).json()["frames_done"])
+
+        await eventually_true(has_begun)
+        await drain(server, within_s=0.1)
+        assert (tmp_path / "jobs" / job_id / "checkpoint").exists()
+    async with running_server(RecallModel(), **flags) as server, http_to(server) as http:
+        assert (await ended(http, job_id))["state"] == "done"
+        metrics = (await http.get("/metrics")).text
+    assert "vergence_sequence_frames_total 40.0" not in metrics, "all frames were stepped again"
+
+
 def test_the_end_of_its_input_ends_a_server_that_a_program_started() -> None:
     with served(*SMALL, "--until-eof") as process:
         assert process.stdout is not None
@@ -174,17 +230,19 @@ async def test_a_server_starts_and_ends_where_no_event_loop_handles_signals(
         flags={"grpc.port": 0, "http.port": 0, "batch.directory": tmp_path, **model}
     )
     served_at: list[str] = []
+    stopping = asyncio.Event()
 
     def on_serving(server: Running) -> None:
         served_at.append(server.grpc_address)
         os.kill(os.getpid(), signal.SIGTERM)
 
     try:
-        await asyncio.wait_for(serve(settings, on_serving=on_serving), 20)
+        await asyncio.wait_for(serve(settings, on_serving=on_serving, on_stopping=stopping.set), 20)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
     assert served_at
+    assert stopping.is_set()
 
 
 @pytest.mark.parametrize(

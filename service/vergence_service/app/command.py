@@ -2,8 +2,11 @@
 
 import asyncio
 import logging
+import os
 import sys
+import threading
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +17,8 @@ from vergence_service.inference.providers import ProviderUnavailable
 from vergence_service.malloc import keep_freed_memory
 from vergence_service.settings import SettingsError, load_settings
 from vergence_service.transports.errors import ExtraMissing, PortTaken, ZenohUnreachable
+
+log = logging.getLogger(__name__)
 
 # Errors that an operator can fix. They are reported in one line, without a traceback.
 _OPERATOR_ERRORS = (
@@ -49,10 +54,28 @@ def run_server(
         logging.getLogger("uvicorn.error").setLevel(logging.WARNING)  # says "started" too early
         keep_freed_memory()
         raise_descriptor_limit()
-        asyncio.run(serve(settings, on_serving=_announce, until_eof=until_eof))
+        ending = partial(_end_after, 2 * settings.server.drain_s)
+        asyncio.run(serve(settings, on_serving=_announce, on_stopping=ending, until_eof=until_eof))
     except _OPERATOR_ERRORS as error:
         sys.stderr.write(f"vergence serve: {error}\n")
         raise SystemExit(2) from None
+
+
+def _end_after(seconds: float) -> None:
+    """End the process after this time, whatever it does then.
+
+    By then, answers are sent and jobs have kept their progress. But work in a thread cannot be
+    stopped, for example a step of a large image, and Python waits for its threads.
+    """
+
+    def end() -> None:
+        log.warning("the server did not end in %g s, twice server.drain_s; it ends now", seconds)
+        logging.shutdown()
+        os._exit(0)
+
+    timer = threading.Timer(seconds, end)
+    timer.daemon = True  # it must not keep the process that it is there to end
+    timer.start()
 
 
 def _announce(server: Running) -> None:

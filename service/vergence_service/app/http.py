@@ -3,7 +3,7 @@
 import asyncio
 import logging
 import os
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, contextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import version
@@ -13,6 +13,7 @@ from tempfile import TemporaryDirectory
 from prometheus_client import CollectorRegistry
 
 from vergence_service.jobs.archives import ArchiveLimits
+from vergence_service.jobs.places import Places
 from vergence_service.jobs.queue import JobQueue, QueueLimits
 from vergence_service.jobs.store import JobStore, StoreInUse, StoreUnavailable
 from vergence_service.settings import Settings
@@ -37,7 +38,9 @@ class HttpTransport:
     """The HTTP server while it runs."""
 
     server: HttpServer
-    start_jobs: Callable[[], None]  # call it when every graph is loaded
+    jobs: (
+        JobQueue | None
+    )  # to be started when every graph is loaded; None: there is no disk for jobs
 
 
 @asynccontextmanager
@@ -74,6 +77,8 @@ async def serving_http(
         min_bytes_per_s=min_bytes_per_s,
         archive=replace(archive, max_files=2),
     )
+    places = Places(settings.limits.pairs)
+    engine.metrics.pairs.set_function(lambda: len(places))
     stopping = asyncio.Event()
     async with AsyncExitStack() as stack:
         # First of all: a server that cannot listen must not take a folder of jobs.
@@ -81,7 +86,7 @@ async def serving_http(
             listening_socket(host, settings.http.port, transport="http")
         )
         routes = [
-            pair_routes(engine, limits=pair),
+            pair_routes(engine, places, limits=pair),
             stream_routes(
                 calls,
                 unary,
@@ -89,14 +94,13 @@ async def serving_http(
                 min_bytes_per_s=min_bytes_per_s,
             ),
         ]
-        start: Callable[[], None]
+        queue: JobQueue | None = None
         try:
             store = stack.enter_context(_job_store(settings))
         except StoreUnavailable as error:
             # Without a disk the server can still serve live streams.
             log.warning("this server accepts no sequences: %s", error)
             routes.append(no_sequence_routes(str(error)))
-            start = _nothing
         else:
             queue = await stack.enter_async_context(
                 JobQueue(
@@ -114,7 +118,6 @@ async def serving_http(
             routes.append(
                 sequence_routes(queue, model=engine.card.name, limits=upload, stopping=stopping)
             )
-            start = queue.start
         app = make_http_app(
             version=version("vergence"),
             ready=lambda: engine.ready,
@@ -135,11 +138,7 @@ async def serving_http(
                 stopping=stopping,
             )
         )
-        yield HttpTransport(server, start)
-
-
-def _nothing() -> None:
-    """Start no jobs, because there is no queue."""
+        yield HttpTransport(server, queue)
 
 
 @contextmanager

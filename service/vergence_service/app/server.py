@@ -17,6 +17,7 @@ from vergence_service.descriptors import affordable_connections
 from vergence_service.inference.batcher import StepBatcher
 from vergence_service.inference.model import StereoModel
 from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
+from vergence_service.jobs.queue import JobQueue
 from vergence_service.metrics import Metrics
 from vergence_service.settings import Settings
 from vergence_service.streams.continuity import ContinuityLimits
@@ -43,6 +44,7 @@ class Running:
     engine: DepthEngine
     grpc: GrpcServer
     http: HttpServer
+    jobs: JobQueue | None
     zenoh: ZenohTransport | None
     loading: asyncio.Task[None]  # of the graphs that live streams do not need
 
@@ -148,30 +150,43 @@ async def running(
         await grpc_server.serving()
         if zenoh is not None:
             await zenoh.server.serving()
-        async with _in_background(_load_rest(engine, http.start_jobs)) as loading:
+        async with _in_background(_load_rest(engine, http.jobs)) as loading:
             yield Running(
                 format_address(grpc_host, grpc_server.port),
                 format_address(http_host, http.server.port),
                 engine,
                 grpc_server,
                 http.server,
+                http.jobs,
                 zenoh,
                 loading,
             )
 
 
 async def serve(
-    settings: Settings, *, on_serving: Callable[[Running], None], until_eof: bool = False
+    settings: Settings,
+    *,
+    on_serving: Callable[[Running], None],
+    on_stopping: Callable[[], None],
+    until_eof: bool = False,
 ) -> None:
     """Serve until SIGTERM, SIGINT or SIGHUP, then drain; ``until_eof``: or until the input ends.
+
+    ``on_stopping`` is called when the drain begins.
 
     Raises FileNotFoundError, ManifestError or ProviderUnavailable if the model cannot be loaded;
     PortTaken, ExtraMissing or ZenohUnreachable if a transport cannot start.
     """
     stop = asyncio.Event()
-    on_signals(STOP_SIGNALS, lambda _: stop.set())
+
+    def stop_serving(_: int) -> None:
+        if not stop.is_set():
+            on_stopping()
+            stop.set()
+
+    on_signals(STOP_SIGNALS, stop_serving)
     if until_eof:
-        on_end_of_input(lambda _: stop.set())
+        on_end_of_input(stop_serving)
     with closing(make_model(settings)) as model:
         async with running(settings, model) as server:
             on_serving(server)
@@ -182,18 +197,24 @@ async def serve(
 
 
 async def drain(server: Running, *, within_s: float) -> None:
-    """Notify clients, let them leave, and answer what they have sent, in twice ``within_s``."""
+    """Notify clients, let them leave, and answer what they have sent, in twice ``within_s``.
+
+    Jobs stop at once: they keep their place and their progress for the next server.
+    """
     server.engine.drain(within_s=within_s)
     async with asyncio.TaskGroup() as tasks:
+        if server.jobs is not None:
+            tasks.create_task(server.jobs.stop())
         tasks.create_task(server.grpc.drain(within_s=within_s))
         tasks.create_task(server.http.drain(within_s=within_s))
         if server.zenoh is not None:
             tasks.create_task(server.zenoh.server.drain(within_s=within_s))
 
 
-async def _load_rest(engine: DepthEngine, start_jobs: Callable[[], None]) -> None:
+async def _load_rest(engine: DepthEngine, jobs: JobQueue | None) -> None:
     await engine.load_rest()
-    start_jobs()
+    if jobs is not None:
+        jobs.start()
 
 
 async def _sweep(streams: StreamTable) -> None:

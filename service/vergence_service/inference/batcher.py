@@ -53,7 +53,8 @@ class StepBatcher:
     """Collects the steps that wait for the model and runs them, oldest first.
 
     Live steps run first. Other steps run in the gaps, in separate batches. A non-live step that
-    would delay a live frame (running or expected soon) waits, at most ``_PATIENCE_S``.
+    would delay a live frame (running or expected soon) waits, at most ``_PATIENCE_S``. Of several
+    lanes, one is never taken by such steps while there are live streams.
 
     Every waiter gets a result or an exception: ModelFailed, NonFinite, FrameStale, or Draining if
     the batcher ends first. A caller must never have two steps of one stream waiting.
@@ -69,6 +70,7 @@ class StepBatcher:
     ) -> None:
         lanes = model.max_concurrent_steps
         self._model = model
+        self._lanes = lanes
         # In a batch the first row would wait for the last while another lane is free.
         self._max_batch = max_batch if lanes == 1 else 1
         self._clock = clock
@@ -160,7 +162,12 @@ class StepBatcher:
         """Return the time that ``first`` must wait so that it delays no live frame."""
         now_s = self._clock()
         patience_s = _PATIENCE_S - (now_s - first.since_s)
-        if first.live or patience_s <= 0:
+        if first.live:
+            return 0.0
+        others = sum(not item.live for item in self._in_model)
+        if len(self._arrivals) and others >= max(self._lanes - 1, 1):
+            return _PATIENCE_S  # the last lane is for the next live frame
+        if patience_s <= 0:
             return 0.0
         if any(item.live for item in self._in_model):
             return patience_s

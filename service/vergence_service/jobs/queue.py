@@ -58,11 +58,15 @@ class JobQueue:
         return self
 
     async def __aexit__(self, *exc_info: object) -> None:
-        await self._worker.stop()
+        await self.stop()
 
     def start(self) -> None:
         """Run the waiting jobs, those of earlier servers first."""
         self._worker.start()
+
+    async def stop(self) -> None:
+        """Run no more jobs. The running one keeps its place and its progress."""
+        await self._worker.stop()
 
     @asynccontextmanager
     async def reserve_slot(self, client: str) -> AsyncIterator[Path]:

@@ -1,12 +1,14 @@
 """Run one job: step its input to the last frame and write the result to disk."""
 
+import asyncio
 import time
 from collections.abc import AsyncGenerator, AsyncIterable
-from contextlib import aclosing
+from contextlib import aclosing, suppress
 from pathlib import Path
 
 from vergence_proto.accuracy import Accuracy, accuracy
 from vergence_proto.datasets import DatasetError, StereoSource
+from vergence_proto.errors import Draining
 from vergence_proto.jobs import Output
 from vergence_proto.ordered import in_order
 from vergence_proto.types import Delivery, OutputFormat
@@ -60,10 +62,17 @@ async def run_job(
     start, state = (before.frames, before.state) if before else (0, None)
     measured = list(before.measured) if before else []
     progress.frames_found = progress.frames_done = start
+    unsaved: Stepped | None = None  # the last frame that was written since the last checkpoint
     checkpoint_due_s = time.monotonic() + checkpoint_s
 
     async def write(stepped: Stepped) -> tuple[Stepped, Accuracy | None]:
         return stepped, await background.run(_write_and_measure, result, stepped)
+
+    async def save(stepped: Stepped) -> None:
+        checkpoint = Checkpoint(
+            stepped.index + 1, stepped.state, engine.card.weights_sha256, tuple(measured)
+        )
+        await background.run(write_checkpoint, folder / _CHECKPOINT, checkpoint)
 
     config = job_stream_config(sequence, job.options)
     try:
@@ -78,17 +87,18 @@ async def run_job(
                     measured.append(found)
                 progress.frames_done += 1
                 engine.metrics.sequence_frames.inc()
+                unsaved = stepped
                 if time.monotonic() >= checkpoint_due_s:
-                    checkpoint = Checkpoint(
-                        progress.frames_done,
-                        stepped.state,
-                        engine.card.weights_sha256,
-                        tuple(measured),
-                    )
-                    await background.run(write_checkpoint, folder / _CHECKPOINT, checkpoint)
+                    await save(stepped)
+                    unsaved = None
                     checkpoint_due_s = time.monotonic() + checkpoint_s
     except DatasetError as error:
         raise sequence_error(error, folder / "input") from None
+    except (asyncio.CancelledError, Draining):
+        if unsaved is not None:
+            with suppress(OSError):  # the next server continues from here, or from the last one
+                await save(unsaved)
+        raise
     mean = Accuracy.mean(measured)
     return mean if mean.n else None
 

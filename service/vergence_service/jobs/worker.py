@@ -48,6 +48,8 @@ class JobWorker:
 
     def start(self) -> None:
         """Run the waiting jobs, those of earlier servers first, until :meth:`stop`."""
+        if self._leaving:
+            return
         self._tasks = [
             asyncio.create_task(self._run_all(), name="sequences"),
             asyncio.create_task(self._expire_regularly(), name="expire results"),
@@ -55,6 +57,7 @@ class JobWorker:
 
     async def stop(self) -> None:
         """Stop at the current frame. The running job keeps its place for the next server."""
+        self._leaving = True
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)

@@ -9,6 +9,10 @@ from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.transports.stream_call import DepthCall, StreamLimits
 
+# A drain takes at most twice its time: once for clients to leave, and this share of it for the
+# answers to what they have sent. The rest is for the server to end.
+FINISHING_SHARE = 0.75
+
 
 class OpenCalls:
     """Makes calls, keeps track of those that run, and ends them when the server drains."""

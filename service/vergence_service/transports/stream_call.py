@@ -14,7 +14,8 @@ from vergence_service.transports.mailbox import Mailbox, QueuedFrame
 from vergence_service.transports.outbox import Outbox
 from vergence_service.transports.unary import model_info
 
-# A large answer may take longer than ``write_s`` over a slow link.
+# ``write_s`` is the time for answers up to this size. Larger ones have more time, in proportion.
+_USUAL_BYTES = 1 << 20
 _SLOWEST_READER_BYTES_S = 64 << 10
 
 
@@ -31,6 +32,10 @@ class StreamLimits:
 
 class ClientLost(Exception):
     """The client is silent or does not read. It may not see how its call ends, and may resume."""
+
+    def __init__(self, why: str, *, reads: bool) -> None:
+        super().__init__(why)
+        self.reads = reads
 
 
 class DepthCall:
@@ -131,20 +136,25 @@ class DepthCall:
                 await sending
                 watching.cancel()
         except* ClientLost as group:
-            lost = ClientLost(*group.exceptions[0].args)
+            [first, *_] = group.exceptions
+            assert isinstance(first, ClientLost)  # a task of the group raised it
+            lost = first
         if lost is not None:
             raise lost
 
     async def _raise_if_lost(self) -> None:
-        raise ClientLost(await self._lost)
+        raise ClientLost(await self._lost, reads=True)
 
     async def _write_in_time(self, response: pb.StreamDepthResponse) -> None:
-        patience_s = self._limits.write_s + response.ByteSize() / _SLOWEST_READER_BYTES_S
+        more_bytes = max(response.ByteSize() - _USUAL_BYTES, 0)
+        patience_s = self._limits.write_s + more_bytes / _SLOWEST_READER_BYTES_S
         try:
             async with asyncio.timeout(patience_s):
                 await self._write(response)
         except TimeoutError:
-            raise ClientLost(f"the client did not read an answer for {patience_s:.0f} s") from None
+            raise ClientLost(
+                f"the client did not read an answer for {patience_s:.0f} s", reads=False
+            ) from None
 
     async def _open(self) -> tuple[Stream, bool]:
         request = await anext(aiter(self._requests), None)

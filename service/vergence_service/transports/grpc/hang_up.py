@@ -21,15 +21,16 @@ from vergence_service.transports.grpc.errors import Context
 _STATUS_S = 1.0
 
 
-async def hang_up(context: Context, why: str, *, shared: bool) -> None:
+async def hang_up(context: Context, why: str, *, reads: bool, shared: bool) -> None:
     """End the call with UNAVAILABLE, as if its connection were lost. Does not return.
 
     If the client does not read, end the call without a status, or, unless the connection is
     ``shared`` by other calls, close the connection.
     """
-    with suppress(TimeoutError):
-        async with asyncio.timeout(_STATUS_S):
-            await context.abort(grpc.StatusCode.UNAVAILABLE, why)
+    if reads:
+        with suppress(TimeoutError):
+            async with asyncio.timeout(_STATUS_S):
+                await context.abort(grpc.StatusCode.UNAVAILABLE, why)
     if shared or not _close_connection(context.peer()):
         _cancel(context)
     raise asyncio.CancelledError  # gRPC takes this as the end of a call that was cancelled

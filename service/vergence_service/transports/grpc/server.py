@@ -19,7 +19,7 @@ from vergence_service.transports.grpc.deadlines import FirstMessageDeadline
 from vergence_service.transports.grpc.errors import Context, errors_as_status
 from vergence_service.transports.grpc.hang_up import hang_up
 from vergence_service.transports.grpc.small_requests import SmallRequests
-from vergence_service.transports.open_calls import OpenCalls
+from vergence_service.transports.open_calls import FINISHING_SHARE, OpenCalls
 from vergence_service.transports.stream_call import ClientLost
 from vergence_service.transports.unary import UnaryMethods
 
@@ -89,7 +89,7 @@ class DepthServicer:
                 await self.calls.run(call)
             except ClientLost as lost:
                 log.info("a call over gRPC counts as lost: %s", lost)
-                await hang_up(context, str(lost), shared=self._by_peer[peer] > 1)
+                await hang_up(context, str(lost), reads=lost.reads, shared=self._by_peer[peer] > 1)
             finally:
                 self._by_peer[peer] -= 1
                 if not self._by_peer[peer]:
@@ -174,7 +174,7 @@ class GrpcServer:
         """Wait until all calls end; after ``within_s``, answer what they have sent and end them."""
         await self._set_health(health_pb2.HealthCheckResponse.NOT_SERVING)
         await self._servicer.calls.drain(within_s=within_s)
-        await self._server.stop(grace=within_s)
+        await self._server.stop(grace=FINISHING_SHARE * within_s)
 
     async def _set_health(self, status: health_pb2.HealthCheckResponse.ServingStatus) -> None:
         for service in ("", _SERVICE):

@@ -16,7 +16,7 @@ from pydantic.json_schema import models_json_schema
 from vergence_service.transports.http.connections import BoundedConnection, ConnectionLimits
 from vergence_service.transports.http.errors import Problem, install_problems
 from vergence_service.transports.http.uploads import SequenceForm
-from vergence_service.transports.open_calls import OpenCalls
+from vergence_service.transports.open_calls import FINISHING_SHARE, OpenCalls
 
 _ABOUT = """Disparity of whole stereo sequences, as a job, and of single pairs.
 
@@ -125,18 +125,23 @@ class HttpServer:
             log_config=None,
             access_log=False,
             lifespan="off",
-            timeout_graceful_shutdown=_FINISH_S,
         )
         self._server = _Uvicorn(config)
         self._task = asyncio.create_task(self._server.serve([self._socket]), name="http")
         return self
 
     async def __aexit__(self, *exc_info: object) -> None:
-        self._stopping.set()
         await self._calls.drain(within_s=0)
-        self._server.should_exit = True
-        await self._task
+        await self._finish(within_s=_FINISH_S)
 
     async def drain(self, *, within_s: float) -> None:
         """Wait until all calls end; after ``within_s``, answer what they have sent and end them."""
         await self._calls.drain(within_s=within_s)
+        await self._finish(within_s=FINISHING_SHARE * within_s)
+
+    async def _finish(self, *, within_s: float) -> None:
+        """Accept no more requests, and wait for the answers that are being sent."""
+        self._stopping.set()
+        self._server.config.timeout_graceful_shutdown = within_s  # type: ignore[assignment] # takes fractions
+        self._server.should_exit = True
+        await self._task

@@ -2,6 +2,7 @@
 
 import io
 import tempfile
+from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,6 +24,7 @@ from vergence_proto.types import (
     StereoFrame,
     StereoRig,
 )
+from vergence_service.jobs.places import Places
 from vergence_service.jobs.upload_checks import check_file
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.stream import StreamConfig
@@ -33,6 +35,7 @@ from vergence_service.transports.http.uploads import (
     UploadLimits,
     media_type,
     receive_form,
+    while_connected,
 )
 
 
@@ -99,8 +102,8 @@ _ANSWER: dict[int | str, dict[str, Any]] = {
 }
 
 
-def pair_routes(engine: DepthEngine, *, limits: UploadLimits) -> APIRouter:
-    """Make the route."""
+def pair_routes(engine: DepthEngine, places: Places, *, limits: UploadLimits) -> APIRouter:
+    """Make the route. Pairs that are uploaded take one of the ``places``."""
     router = APIRouter(tags=["pairs"], responses=PROBLEM_RESPONSE)
 
     @router.post("/v1/pairs", response_class=Response, responses=_ANSWER, openapi_extra=_BODY)
@@ -109,8 +112,15 @@ def pair_routes(engine: DepthEngine, *, limits: UploadLimits) -> APIRouter:
 
         `curl -F left=@left.png -F right=@right.png HOST/v1/pairs -o disparity.png`
         """
+        places.check()  # before the upload, which would be for nothing
+        with tempfile.TemporaryDirectory() as scratch:
+            files = await _upload(request, Path(scratch), limits, engine.threads.background)
+            async with while_connected(request), places.taken():
+                return await stepped(files, query)
+
+    async def stepped(files: Mapping[str, Path], query: PairQuery) -> Response:
         background = engine.threads.background
-        left, right = await _images(request, limits, background, max_pixels=engine.max_pixels)
+        left, right = await background.run(_images, files, max_pixels=engine.max_pixels)
         height, width = left.shape[:2]
         nominal_px = float(width)  # any focal length gives the same disparity
         rig = RectifiedRig(
@@ -141,20 +151,20 @@ def pair_routes(engine: DepthEngine, *, limits: UploadLimits) -> APIRouter:
     return router
 
 
-async def _images(
-    request: Request, limits: UploadLimits, threads: ThreadPool, *, max_pixels: int
-) -> tuple[Image, Image]:
+async def _upload(
+    request: Request, folder: Path, limits: UploadLimits, threads: ThreadPool
+) -> Mapping[str, Path]:
     if media_type(request) != FORM_TYPE:
         raise BadImage(f"expected a body of {FORM_TYPE} with the files left and right")
-    with tempfile.TemporaryDirectory() as scratch:
-        parts = await receive_form(request, Path(scratch), limits, threads)
-        if sorted(part.name for part in parts) != ["left", "right"]:
-            names = sorted(part.name[:40] for part in parts)
-            raise BadImage(f"expected one file left and one file right, got {names}")
-        images = {
-            part.name: await threads.run(_image, part.path, part.name, max_pixels) for part in parts
-        }
-    left, right = images["left"], images["right"]
+    parts = await receive_form(request, folder, limits, threads)
+    if sorted(part.name for part in parts) != ["left", "right"]:
+        names = sorted(part.name[:40] for part in parts)
+        raise BadImage(f"expected one file left and one file right, got {names}")
+    return {part.name: part.path for part in parts}
+
+
+def _images(files: Mapping[str, Path], *, max_pixels: int) -> tuple[Image, Image]:
+    left, right = (_image(files[name], name, max_pixels) for name in ("left", "right"))
     if left.shape != right.shape:
         raise BadShape(
             f"expected two images of one size, got left {left.shape[1]}x{left.shape[0]} and right "

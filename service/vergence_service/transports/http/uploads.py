@@ -90,7 +90,10 @@ def media_type(request: Request) -> str:
 
 @asynccontextmanager
 async def while_connected(request: Request) -> AsyncIterator[None]:
-    """Cancel the block if the client disconnects, and raise BadSequence. The body must be read."""
+    """Cancel the block if the client disconnects, and raise BadSequence, which it will not see.
+
+    The body of the request must have been read.
+    """
     block, gone = asyncio.current_task(), False
     assert block is not None
 
@@ -106,7 +109,7 @@ async def while_connected(request: Request) -> AsyncIterator[None]:
         yield
     except asyncio.CancelledError:
         if gone and block.uncancel() == 0:
-            raise BadSequence("the client disconnected before its upload was accepted") from None
+            raise BadSequence("the client disconnected") from None
         raise
     finally:
         watching.cancel()

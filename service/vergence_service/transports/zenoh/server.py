@@ -15,7 +15,7 @@ from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.zenoh.keys import ANY, OPEN, UNARY_KEYS, StreamKeys, query_key, server_key
 from vergence_proto.zenoh.session import ZenohSession, make_config, reason_of
 from vergence_service.transports.errors import ZenohUnreachable
-from vergence_service.transports.open_calls import OpenCalls
+from vergence_service.transports.open_calls import FINISHING_SHARE, OpenCalls
 from vergence_service.transports.unary import UnaryMethods
 from vergence_service.transports.zenoh.call import ZenohCall
 from vergence_service.transports.zenoh.errors import status_of
@@ -103,7 +103,7 @@ class ZenohServer:
         """Wait until all calls end; after ``within_s``, answer what they have sent and end them."""
         await self._calls.drain(within_s=within_s)
         if self._tasks:
-            await asyncio.wait(self._tasks, timeout=within_s)
+            await asyncio.wait(self._tasks, timeout=FINISHING_SHARE * within_s)
 
     def _asked(self, query: zenoh.Query) -> None:
         what = str(query.key_expr).rpartition("/")[2]
