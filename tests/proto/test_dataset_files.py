@@ -12,6 +12,7 @@ from hypothesis.extra import numpy as arrays
 from tests.support import dataset_trees as trees
 from vergence_proto.datasets import (
     DatasetError,
+    beyond_png,
     read_disparity_png,
     read_image,
     read_pfm,
@@ -35,18 +36,20 @@ class TestDisparityPng:
         write_disparity_png(path, disparity_px)
         back = read_disparity_png(path)
         assert back.dtype == np.float32
-        known = disparity_px > 0
+        known = (disparity_px > 0) & (disparity_px < 255.99)
         np.testing.assert_array_equal(np.isnan(back), ~known)
-        expected = np.clip(disparity_px[known], 1 / 256, 65535 / 256)
+        expected = np.maximum(disparity_px[known], 1 / 256)
         np.testing.assert_allclose(back[known], expected, rtol=1e-6, atol=1 / 512)
 
     def test_it_is_kitti_s_convention(self, tmp_path: Path) -> None:
         path = tmp_path / "disparity.png"
-        write_disparity_png(path, np.array([[1, 2.5, np.nan, 0, 1000]], np.float32))
+        values = np.array([[1, 2.5, np.nan, 0, 255.996, 256, 1000, np.inf]], np.float32)
+        write_disparity_png(path, values)
         stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         assert stored is not None
         assert stored.dtype == np.uint16
-        np.testing.assert_array_equal(stored, [[256, 640, 0, 0, 65535]])
+        np.testing.assert_array_equal(stored, [[256, 640, 0, 0, 65535, 0, 0, 0]])
+        np.testing.assert_array_equal(beyond_png(values), [[False] * 5 + [True] * 3])
 
     def test_half_a_file_is_an_error(self, tmp_path: Path) -> None:
         path = tmp_path / "disparity.png"

@@ -6,12 +6,14 @@ import struct
 import subprocess
 import sys
 import zlib
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from tests.support.mutants import damaged, image_files, png_bomb, png_header, png_of
 from vergence_proto.codec.image_files import image_kind, read_image_file
@@ -184,3 +186,35 @@ def test_a_webp_must_be_one_image_of_the_size_in_its_header() -> None:
     ):
         with pytest.raises(BadImage):
             decode_image(bad)
+
+
+def _png(samples: NDArray[Any]) -> bytes:
+    done, file = cv2.imencode(".png", samples)
+    assert done
+    return file.tobytes()
+
+
+class TestBitDepths:
+    """Samples become 8 bits; what a file holds beyond three colours is left out."""
+
+    EIGHT = np.random.default_rng(5).integers(0, 256, (9, 7, 3), np.uint8)
+
+    @pytest.mark.parametrize("shift", [0, 8])
+    @pytest.mark.parametrize("channels", [1, 3, 4])
+    def test_sixteen_bits_are_read_at_either_end(self, shift: int, channels: int) -> None:
+        alpha = np.full((9, 7, 1), 200, np.uint8)
+        bgr = np.concatenate([self.EIGHT, alpha], axis=2)[..., :channels]
+        read = decode_image(_png(np.squeeze(bgr.astype(np.uint16) << shift)))
+        expected = np.repeat(bgr, 3, axis=2) if channels == 1 else bgr[..., 2::-1]
+        np.testing.assert_array_equal(read, expected)
+
+    @pytest.mark.parametrize("bits", [10, 12, 16])
+    def test_more_bits_lose_the_lower_ones(self, bits: int) -> None:
+        samples = np.random.default_rng(bits).integers(0, 1 << bits, (9, 7)).astype(np.uint16)
+        samples[0, 0] = (1 << bits) - 1
+        np.testing.assert_array_equal(decode_image(_png(samples))[..., 0], samples >> 8)
+
+    def test_a_pgm_of_sixteen_bits(self) -> None:
+        samples = (np.arange(63).reshape(9, 7) * 1000).astype(">u2")
+        read = decode_image(b"P5\n7 9\n65535\n" + samples.tobytes())
+        np.testing.assert_array_equal(read[..., 2], samples >> 8)

@@ -101,7 +101,13 @@ HOSTILE = {
     ),
     "path up": Hostile(lambda: with_file("../../evil"), "BAD_SEQUENCE", says="below"),
     "path from the root": Hostile(lambda: with_file("/etc/evil"), "BAD_SEQUENCE", says="below"),
-    "path of Windows": Hostile(lambda: with_file("C:\\evil"), "BAD_SEQUENCE", says="below"),
+    "path up of Windows": Hostile(
+        lambda: with_file("a\\..\\..\\evil"), "BAD_SEQUENCE", says="below"
+    ),
+    "path of a network": Hostile(lambda: with_file("\\\\evil\\x"), "BAD_SEQUENCE", says="below"),
+    "path up among companions": Hostile(
+        lambda: with_file("__MACOSX/../../evil"), "BAD_SEQUENCE", says="below"
+    ),
     "tar path up": Hostile(
         lambda: tar_bytes([("a/../../evil", b"x")], "w"), "BAD_SEQUENCE", says="below"
     ),

@@ -44,7 +44,7 @@ from vergence_proto.errors import ErrorCode
 from vergence_proto.types import Plane
 from vergence_service.inference.model import Step, StepResult
 from vergence_service.transports.http.errors import HTTP_STATUS
-from vergence_service.transports.http.pairs import RANGE_HEADER
+from vergence_service.transports.http.pairs import BEYOND_HEADER, RANGE_HEADER
 
 FRAMES = make_frames(6)
 ARCHIVE = zip_bytes(sequence_files(FRAMES))
@@ -279,12 +279,27 @@ async def test_a_pair_is_answered_at_once() -> None:
     assert rounded.headers["Content-Type"] == "image/png"
     stored = cv2.imdecode(np.frombuffer(rounded.content, np.uint8), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(stored, np.rint(expected.disparity_px * 256))
+    assert rounded.headers[BEYOND_HEADER] == "0"
     assert float(rounded.headers[RANGE_HEADER]) == expected.max_disparity_px == 64
     confidence = cv2.imdecode(np.frombuffer(sure.content, np.uint8), cv2.IMREAD_UNCHANGED)
     assert confidence is not None
     assert confidence.dtype == np.uint8
     assert confidence.shape == (RIG.height, RIG.width)
     assert confidence.any()
+
+
+async def test_a_depth_that_a_png_cannot_hold_has_no_value_in_it() -> None:
+    files = {"left": png(FRAMES[0].left), "right": png(FRAMES[0].right)}
+    query: dict[str, str | float] = {"output": "depth", "fx_px": 4000.0, "baseline_m": 1.0}
+    async with http_server(RecallModel()) as client:
+        coarse = await client.post("/v1/pairs", params=query, files=files)
+        exact = await client.post("/v1/pairs", params={**query, "format": "npy"}, files=files)
+    depth_m = np.load(io.BytesIO(exact.content))
+    beyond = depth_m > 255.998
+    assert beyond.any()
+    stored = cv2.imdecode(np.frombuffer(coarse.content, np.uint8), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(stored == 0, beyond | np.isnan(depth_m))
+    assert int(coarse.headers[BEYOND_HEADER]) == beyond.sum()
 
 
 async def test_health_metrics_and_schema_answer() -> None:

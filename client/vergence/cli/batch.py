@@ -27,6 +27,8 @@ from vergence_proto.jobs import JobState
 # So many are packed and sent at once; the server runs them one after the other.
 _AT_ONCE = 3
 _CONNECT_S = 10.0
+# A server of one's own takes any image; what an archive holds shows only there.
+_LARGEST_PIXELS = 50_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +56,7 @@ async def batch(
     """
     uploads = find_uploads(list(paths))
     if server is None:
-        async with local_server(scheme="http") as address:
+        async with local_server(scheme="http", pixels=_LARGEST_PIXELS) as address:
             outcomes, seconds = await _send(uploads, address, out, form, query, console)
     else:
         address = server if "://" in server else f"http://{server}"

@@ -40,7 +40,7 @@ async def demo(
     filmed = list(source)[:frames]
     report = Report()
     async with (
-        server_for(None, console) as server,
+        server_for(None, console, pixels=source.rig.left.width * source.rig.left.height) as server,
         DepthClient(server) as client,
         client.open_session(source.rig, delivery=Delivery.EVERY, output=WITH_SIGMA) as session,
     ):

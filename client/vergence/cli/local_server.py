@@ -22,14 +22,25 @@ _LISTENING = re.compile(r"listening grpc=(\S+) http=(\S+)")
 _READY = "ready"
 _START_TIMEOUT_S = 60.0  # loading and warming a model up takes seconds on a small machine
 _STOP_TIMEOUT_S = 15.0
+
+# Every server accepts images of this size. Larger ones need room: two images of three bytes a
+# pixel in a message, and the state of a stream.
+_USUAL_PIXELS = 4_000_000
+_BYTES_A_PIXEL = 7
+_STATE_BYTES_A_PIXEL = 64
 _LOOK_S = 1.0
 
 
 @asynccontextmanager
 async def local_server(
-    arguments: Sequence[str] = (), *, scheme: Literal["grpc", "http"] = "grpc"
+    arguments: Sequence[str] = (),
+    *,
+    scheme: Literal["grpc", "http"] = "grpc",
+    pixels: int = 0,
 ) -> AsyncIterator[str]:
     """Start ``python -m vergence_service`` on free ports; yields ``SCHEME://HOST:PORT``.
+
+    The limits of images leave room for ``pixels``, unless the environment sets them.
 
     Raises CliError: the server is not installed or does not start; its last lines are quoted.
     """
@@ -49,7 +60,7 @@ async def local_server(
             *("--grpc-port", "0", "--http-port", "0", "--host", "127.0.0.1", "--no-zenoh"),
             "--until-eof",
             *arguments,
-            env={**os.environ, "VERGENCE_BATCH__DIRECTORY": jobs},
+            env={**settings_for(pixels), **os.environ, "VERGENCE_BATCH__DIRECTORY": jobs},
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
             stderr=log,
@@ -60,9 +71,27 @@ async def local_server(
             await _stop(process)
 
 
+def settings_for(pixels: int) -> dict[str, str]:
+    """Return settings for images that are larger than a server of others accepts."""
+    if pixels <= _USUAL_PIXELS:
+        return {}
+    frame_mib = 1 + _BYTES_A_PIXEL * pixels // (1 << 20)
+    state_mib = 1 + _STATE_BYTES_A_PIXEL * pixels // (1 << 20)
+    return {
+        "VERGENCE_LIMITS__MAX_PIXELS": str(pixels),
+        "VERGENCE_LIMITS__MAX_FRAME_MIB": str(frame_mib),
+        "VERGENCE_LIMITS__MAX_STATE_MIB": str(state_mib),
+    }
+
+
 @asynccontextmanager
-async def server_for(server: str | None, console: Console) -> AsyncIterator[str]:
-    """Yield ``server``, or the address of a local server for the length of the block."""
+async def server_for(
+    server: str | None, console: Console, *, pixels: int = 0
+) -> AsyncIterator[str]:
+    """Yield ``server``, or the address of a local server for the length of the block.
+
+    A local server accepts images of ``pixels``.
+    """
     if server is not None:
         yield server
         return
@@ -70,7 +99,7 @@ async def server_for(server: str | None, console: Console) -> AsyncIterator[str]
         place = DEFAULT_SERVER.partition("://")[2]
         console.print(f"[dim]a server answers at {place}; to use it, add --server {place}[/]")
     with console.status("starting a server") as status:
-        async with local_server() as address:
+        async with local_server(pixels=pixels) as address:
             status.stop()
             yield address
             status.update("stopping the server")

@@ -58,7 +58,9 @@ async def run(
     for note in _notes(footage):
         console.print(f"[yellow]note[/]       {note}")
     async with (
-        server_for(server, console) as address,
+        server_for(
+            server, console, pixels=footage.rig.left.width * footage.rig.left.height
+        ) as address,
         DepthClient(address) as client,
         client.open_session(
             footage.rig,

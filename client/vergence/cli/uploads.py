@@ -7,6 +7,7 @@ from pathlib import Path
 
 from vergence.cli.errors import CliError
 from vergence_proto.datasets import DATASETS, DatasetError, find_sources
+from vergence_proto.datasets.listing import found
 
 _ARCHIVES = (".zip", ".tar", ".tar.gz", ".tgz", ".tar.xz", ".txz", ".tar.bz2", ".tbz2")
 _OWN_LAYOUT = "vergence"
@@ -25,8 +26,9 @@ class Upload:
         if self.path.is_file():
             return self.path
         archive = scratch / f"{self.name}.zip"
-        with zipfile.ZipFile(archive, "w") as file:
-            for each in sorted(self.path.rglob("*")):
+        # A file system may state a time before 1980, which the format cannot.
+        with zipfile.ZipFile(archive, "w", strict_timestamps=False) as file:
+            for each in found(self.path, "*"):
                 if each.is_file():
                     file.write(each, each.relative_to(self.path))
         return archive
@@ -46,8 +48,9 @@ def find_uploads(paths: list[Path]) -> list[Upload]:
 
 
 def _at(path: Path) -> Iterator[Upload]:
-    if path.is_file() and path.name.endswith(_ARCHIVES):
-        yield Upload(path.name.partition(".")[0], path)
+    suffix = next((each for each in _ARCHIVES if path.name.lower().endswith(each)), None)
+    if path.is_file() and suffix is not None:
+        yield Upload(path.name[: -len(suffix)] or path.name, path)
         return
     if not path.is_dir():
         raise CliError(

@@ -160,7 +160,10 @@ def _error_from_rpc(error: grpc.aio.AioRpcError, address: str, through: str) -> 
         return ours
     code, details = error.code(), error.details()
     if code is grpc.StatusCode.RESOURCE_EXHAUSTED:  # gRPC's own limit on a message
-        return FrameTooLarge(f"{address} refused the message: {details}")
+        return FrameTooLarge(
+            f"{address} refused the message: {details}; the server's setting limits.max_frame_mib "
+            "allows more"
+        )
     if code is grpc.StatusCode.UNIMPLEMENTED:
         return NotReady(f"{address} speaks gRPC but does not offer vergence.v1: {details}")
     # Only the end of gRPC's sentence is informative.

@@ -158,7 +158,8 @@ class ZenohCall:
         # Far above its limit, a server's Zenoh link drops a message silently.
         if (size := frame.ByteSize()) > self._max_frame_bytes:
             error = FrameTooLarge(
-                f"expected a frame of at most {self._max_frame_bytes} bytes, got {size}"
+                f"expected a frame of at most {self._max_frame_bytes} bytes, got {size}; send "
+                "JPEG, or start the server with a larger limits.max_frame_mib"
             )
             refusal = codec.error_to_frame_error(frame.frame_id, error)
             self._inbox.put_local(pb.StreamDepthResponse(frame_error=refusal))

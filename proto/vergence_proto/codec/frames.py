@@ -113,7 +113,8 @@ def check_frame(
     most = _BYTES_BESIDE_PIXELS + _BYTES_A_PIXEL * left.width * left.height
     if max_bytes is not None and left_bytes + right_bytes > max_bytes:
         raise FrameTooLarge(
-            f"expected a frame of at most {max_bytes} bytes, got {left_bytes} and {right_bytes}"
+            f"expected a frame of at most {max_bytes} bytes, got {left_bytes} and {right_bytes}; "
+            "send JPEG, or start the server with a larger limits.max_frame_mib"
         )
     if max(left_bytes, right_bytes) > most:
         raise FrameTooLarge(

@@ -79,7 +79,8 @@ def read_image_file(
     file, missing = _READERS[kind](data)
     if max_pixels is not None and file.width * file.height > max_pixels:
         raise FrameTooLarge(
-            f"expected at most {max_pixels} pixels per image, got {file.width}x{file.height}"
+            f"expected at most {max_pixels} pixels per image, got {file.width}x{file.height}; "
+            "the server's setting limits.max_pixels allows more"
         )
     if missing:
         raise _cut_short(kind.value, data, f"{missing} cannot be {file.width}x{file.height} pixels")

@@ -21,7 +21,7 @@ from vergence_proto.v1 import depth_pb2 as pb
 _CHANNELS = {pb.IMAGE_ENCODING_MONO8: 1, pb.IMAGE_ENCODING_RGB8: 3}
 
 # The rig describes the rows as they are stored, so a hint to viewers to rotate them is ignored.
-_AS_COLOUR = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+_AS_COLOUR = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 _OUT_OF_MEMORY = -4  # cv::Error::StsNoMem
 
 _FILE_KINDS = {
@@ -116,6 +116,9 @@ def _decoded(file: ImageFile, flags: int) -> NDArray[Any]:
 
 
 def _as_rgb(decoded: NDArray[Any]) -> Image:
+    if decoded.dtype == np.uint16:
+        # The upper bits of each sample. A camera of 8 bits may be stored in 16, at the lower end.
+        decoded = (decoded >> 8 if decoded.max() > 255 else decoded).astype(np.uint8)
     return np.asarray(cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB, dst=decoded), np.uint8)
 
 

@@ -63,6 +63,7 @@ from vergence_proto.datasets import (
 from vergence_proto.datasets.ahead import read_ahead
 from vergence_proto.datasets.files import DatasetError, numbers
 from vergence_proto.datasets.images import (
+    beyond_png,
     encode_disparity_png,
     encode_pfm,
     read_disparity_png,
@@ -81,6 +82,7 @@ __all__ = [
     "SourceFrame",
     "StereoSource",
     "Truth",
+    "beyond_png",
     "detect_sources",
     "encode_disparity_png",
     "encode_pfm",

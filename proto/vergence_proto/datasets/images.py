@@ -45,17 +45,23 @@ def write_disparity_png(path: Path, disparity_px: Plane) -> None:
 
 
 def encode_disparity_png(disparity_px: Plane) -> bytes:
-    """Encode [H, W] pixels as 16-bit PNG in KITTI's convention: times 256, 0 = no value.
+    """Encode [H, W] pixels (or metres) as 16-bit PNG in KITTI's convention: times 256, 0: no value.
 
-    NaN, 0 and negative numbers become "no value". Smaller positive values become 1/256 px, and
-    values above 255.99 px saturate.
+    NaN, 0 and negative numbers become "no value", and so do those that :func:`beyond_png` finds:
+    a largest number in their place would look measured. Smaller positive values become 1/256 px.
     """
     scaled = np.fmax(disparity_px, 0) * _PNG_STEPS_PER_PX
-    stored = np.clip(np.rint(scaled), scaled > 0, 65535).astype(np.uint16)
+    scaled[beyond_png(disparity_px)] = 0
+    stored = np.maximum(np.rint(scaled), scaled > 0).astype(np.uint16)
     done, file = cv2.imencode(".png", stored)
     if not done:
         raise DatasetError(f"{stored.shape} does not fit a PNG")
     return file.tobytes()
+
+
+def beyond_png(values: Plane) -> NDArray[np.bool_]:
+    """Find the values [H, W] that a 16-bit PNG of steps of 1/256 cannot hold: above 255.998."""
+    return np.asarray(values * _PNG_STEPS_PER_PX >= 65535.5)
 
 
 def read_disparity_png(path: Path) -> Plane:

@@ -67,12 +67,14 @@ async def serving_http(
     min_bytes_per_s = settings.limits.min_kib_per_s * 1024
     upload = UploadLimits(
         max_bytes=batch.max_upload_mib * _MIB,
+        max_bytes_setting="batch.max_upload_mib",
         idle_s=batch.idle_s,
         min_bytes_per_s=min_bytes_per_s,
         archive=archive,
     )
     pair = UploadLimits(
         max_bytes=2 * settings.limits.max_frame_mib * _MIB,
+        max_bytes_setting="limits.max_frame_mib",
         idle_s=batch.idle_s,
         min_bytes_per_s=min_bytes_per_s,
         archive=replace(archive, max_files=2),

@@ -1,12 +1,14 @@
 """Unpack an untrusted zip or tar archive into a folder, or refuse it.
 
 Nothing that the archive states is trusted: unpacked bytes are counted, names may only lead below
-the folder, and anything except files and folders is refused.
+the folder, and anything except files and folders is refused. What macOS adds (``__MACOSX``, names
+with a dot in front) is passed over.
 """
 
 import bz2
 import gzip
 import lzma
+import os
 import stat
 import tarfile
 import zipfile
@@ -17,11 +19,14 @@ from io import BufferedIOBase
 from pathlib import Path, PurePosixPath
 from typing import IO, cast
 
+from vergence_proto.datasets.listing import is_data
 from vergence_proto.errors import BadSequence, UploadTooLarge
 
 _CHUNK = 1 << 20
 _LONGEST_NAME = 512
 _LONGEST_PART_BYTES = 255  # limit of common file systems
+# A colon or a backslash is a character like any other, but not on Windows.
+_NOT_IN_NAMES = '\\/:*?"<>|\0' if os.name == "nt" else "\0"
 _ZIP_START = b"PK"
 _DECOMPRESSORS: dict[bytes, Callable[[Path], BufferedIOBase]] = {
     b"\x1f\x8b": gzip.GzipFile,
@@ -77,7 +82,9 @@ def unpacking(archive: Path, folder: Path, limits: ArchiveLimits) -> Iterator[No
     try:
         for member in members(archive, start):
             budget.take_file(member)
-            yield from _writing(member, _target_path(folder, member.name), budget)
+            path = _target_path(folder, member.name)
+            if all(map(is_data, path.relative_to(folder).parts)):
+                yield from _writing(member, path, budget)
     except _DAMAGED as error:
         raise BadSequence(f"expected a complete zip or tar archive: {error}") from None
 
@@ -94,7 +101,10 @@ class _Budget:
     def take_file(self, member: _Member) -> None:
         self._files += 1
         if self._files > self._limits.max_files:
-            raise UploadTooLarge(f"expected at most {self._limits.max_files} files in the archive")
+            raise UploadTooLarge(
+                f"expected at most {self._limits.max_files} files in the archive; the server's "
+                "setting batch.max_files allows more"
+            )
         self._check(self._bytes + member.declared_bytes)
 
     def take_bytes(self, count: int) -> None:
@@ -106,7 +116,7 @@ class _Budget:
             raise UploadTooLarge(
                 f"the archive unpacks to more than {self._allowed_bytes} bytes; the limit "
                 f"is {self._limits.max_unpacked_bytes}, and {self._limits.max_ratio:g} times the "
-                "archive's size"
+                "archive's size (the server's settings batch.max_unpacked_mib and batch.max_ratio)"
             )
 
 
@@ -122,7 +132,7 @@ def _target_path(folder: Path, name: str) -> Path:
 
 def _is_bad_part(part: str) -> bool:
     too_long = len(part.encode()) > _LONGEST_PART_BYTES
-    return too_long or part == ".." or not set(part).isdisjoint("\\:\0")
+    return too_long or part == ".." or not set(part).isdisjoint(_NOT_IN_NAMES)
 
 
 def _writing(member: _Member, path: Path, budget: _Budget) -> Iterator[None]:
@@ -140,15 +150,18 @@ def _writing(member: _Member, path: Path, budget: _Budget) -> Iterator[None]:
 
 def _zip_members(archive: Path, start: bytes) -> Iterator[_Member]:
     with zipfile.ZipFile(archive) as file:
+        # Some tools of Windows write backslashes where the format says slashes.
+        windows = not any("/" in info.filename for info in file.infolist())
         for info in file.infolist():
-            if info.is_dir():
+            name = info.filename.replace("\\", "/") if windows else info.filename
+            if name.endswith("/"):
                 continue
             kind = stat.S_IFMT(info.external_attr >> 16)
             if kind not in (0, stat.S_IFREG):
                 raise BadSequence(f"expected files and folders only, {info.filename!r} is a link")
             if info.flag_bits & 1:
                 raise BadSequence(f"expected an archive without a password: {info.filename!r}")
-            yield _Member(info.filename, info.file_size, _opener(file, info))
+            yield _Member(name, info.file_size, _opener(file, info))
 
 
 def _opener(file: zipfile.ZipFile, info: zipfile.ZipInfo) -> Callable[[], IO[bytes]]:
@@ -172,7 +185,9 @@ def _tar_members(archive: Path, start: bytes) -> Iterator[_Member]:
             content = file.extractfile(info) if info.isreg() and not info.issparse() else None
             if content is None:
                 raise BadSequence(f"expected files and folders only, {info.name!r} is neither")
-            yield _Member(info.name, info.size, _same(content))
+            # Bytes of another encoding: names that nobody looks for need not be text.
+            name = info.name.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+            yield _Member(name, info.size, _same(content))
 
 
 def _same(content: IO[bytes]) -> Callable[[], IO[bytes]]:

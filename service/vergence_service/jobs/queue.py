@@ -93,14 +93,15 @@ class JobQueue:
         waiting = [*(job.client for job in self.jobs.unfinished()), *self._uploading]
         if len(waiting) >= limits.waiting:
             raise QueueFull(
-                f"{limits.waiting} sequences are waiting, the limit of the queue; try again later",
+                f"{limits.waiting} sequences are waiting, the limit of the queue; try again later "
+                "(the server's setting batch.waiting)",
                 retry_after_s=self.jobs.usual_job_s(),
             )
         theirs = waiting.count(client)
         if limits.waiting_per_client is not None and theirs >= limits.waiting_per_client:
             raise Quota(
                 f"{theirs} sequences of {client} are waiting, the limit per client; try again "
-                "later",
+                "later (the server's setting batch.waiting_per_client)",
                 retry_after_s=self.jobs.usual_job_s(),
             )
 

@@ -196,7 +196,8 @@ class JobRegistry:
         if needed_bytes > self._disk_bytes:
             raise UploadTooLarge(
                 f"the sequence and its result need {needed_bytes} bytes, the server keeps "
-                f"{self._disk_bytes} for all sequences; send it in parts"
+                f"{self._disk_bytes} for all sequences; send it in parts, or start the server with "
+                "a larger batch.disk_mib"
             )
         for job in sorted(self._removable(), key=lambda job: job.finished_s or 0):
             if self.used_bytes() + needed_bytes <= self._disk_bytes:
@@ -205,7 +206,8 @@ class JobRegistry:
         if self.used_bytes() + needed_bytes > self._disk_bytes:
             raise QueueFull(
                 f"the waiting sequences use {self.used_bytes()} of {self._disk_bytes} bytes on "
-                f"disk, this one needs {needed_bytes}; try again later",
+                f"disk, this one needs {needed_bytes}; try again later (the server's setting "
+                "batch.disk_mib)",
                 retry_after_s=self.usual_job_s(),
             )
 

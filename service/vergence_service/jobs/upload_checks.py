@@ -51,7 +51,10 @@ def check_file(path: Path, *, max_pixels: int) -> None:
     """
     most_bytes = max_pixels * _BYTES_A_PIXEL + _BEYOND_PIXELS
     if (size := path.stat().st_size) > most_bytes:
-        raise FrameTooLarge(f"expected a file of at most {most_bytes} bytes, got {size}")
+        raise FrameTooLarge(
+            f"expected a file of at most {most_bytes} bytes, got {size}; the server's setting "
+            "limits.max_pixels allows more"
+        )
     data = path.read_bytes()
     if image_kind(data):
         read_image_file(data, max_pixels=max_pixels)
@@ -73,7 +76,8 @@ def _check_arrays(path: Path, most_bytes: int) -> None:
             unpacked = sum(info.file_size for info in members)
             if unpacked > most_bytes:
                 raise FrameTooLarge(
-                    f"expected at most {most_bytes} bytes of arrays, got {unpacked}"
+                    f"expected at most {most_bytes} bytes of arrays, got {unpacked}; the server's "
+                    "setting limits.max_pixels allows more"
                 )
             for info in members:
                 with archive.open(info) as member:

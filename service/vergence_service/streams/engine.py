@@ -282,7 +282,8 @@ class DepthEngine:
         width, height = rig.left.width, rig.left.height
         if width * height > self.max_pixels:
             raise FrameTooLarge(
-                f"expected at most {self.max_pixels} pixels per image, got {width}x{height}"
+                f"expected at most {self.max_pixels} pixels per image, got {width}x{height}; "
+                "send smaller images, or start the server with a larger limits.max_pixels"
             )
 
     async def _rectifier(self, rig: StereoRig) -> Rectifier:

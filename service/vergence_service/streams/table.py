@@ -95,20 +95,21 @@ class StreamTable:
         if self._per_client is not None and count >= self._per_client:
             raise Quota(
                 f"{client} has {count} open streams, the limit per client; close one, or "
-                "try again later",
+                "try again later (the server's setting limits.streams_per_client)",
                 retry_after_s=self._next_expiry_s(theirs),
             )
         if len(self._streams) + len(self._leaving) >= self.capacity:
             raise StreamLimit(
                 f"the server has {self.capacity} open streams, its limit; close one, or "
-                "try again later",
+                "try again later (the server's setting streams.capacity)",
                 retry_after_s=self._next_expiry_s(self._streams.values()),
             )
         reserved = self._reserved_bytes()
         if reserved + state_bytes > self._max_state_bytes:
             raise StateMemory(
                 f"the stream's state needs {state_bytes} bytes; {reserved} of "
-                f"{self._max_state_bytes} are in use; close a stream, or try again later",
+                f"{self._max_state_bytes} are in use; close a stream, or try again later (the "
+                "server's setting limits.max_state_mib)",
                 retry_after_s=self._next_expiry_s(self._streams.values()),
             )
         self._expired_s.pop(stream_id, None)

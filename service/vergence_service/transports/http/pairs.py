@@ -13,7 +13,7 @@ from fastapi import APIRouter, Query, Request, Response
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from vergence_proto.datasets import DatasetError, encode_disparity_png, read_image
+from vergence_proto.datasets import DatasetError, beyond_png, encode_disparity_png, read_image
 from vergence_proto.errors import BadCalibration, BadImage, BadShape, FrameTooLarge
 from vergence_proto.geometry import RectifiedRig
 from vergence_proto.types import (
@@ -21,6 +21,7 @@ from vergence_proto.types import (
     DisparityMap,
     Image,
     OutputFormat,
+    Plane,
     StereoFrame,
     StereoRig,
 )
@@ -71,6 +72,7 @@ class PairQuery(BaseModel):
 
 
 RANGE_HEADER = "Vergence-Max-Disparity-Px"
+BEYOND_HEADER = "Vergence-Beyond-Png"
 _FILE = {"type": "string", "format": "binary"}
 _BODY: dict[str, Any] = {
     "requestBody": {
@@ -95,7 +97,12 @@ _ANSWER: dict[int | str, dict[str, Any]] = {
             RANGE_HEADER: {
                 "description": "range of the search in pixels; nearer surfaces have no value",
                 "schema": {"type": "number"},
-            }
+            },
+            BEYOND_HEADER: {
+                "description": "pixels whose value a 16-bit PNG cannot hold (256 and above); they "
+                "have no value in it, and their value in NPY",
+                "schema": {"type": "integer"},
+            },
         },
         "content": {"image/png": {"schema": _FILE}, "application/octet-stream": {"schema": _FILE}},
     }
@@ -192,11 +199,17 @@ def _answer(disparity: DisparityMap, query: PairQuery) -> Response:
             response = _png(_encoded_png(confidence)) if plain else _npy(confidence)
         case PairOutput.DEPTH:
             depth_m = disparity.depth_m
-            response = _png(encode_disparity_png(depth_m)) if plain else _npy(depth_m)
+            response = _png16(depth_m) if plain else _npy(depth_m)
         case PairOutput.DISPARITY:
             disparity_px = disparity.disparity_px
-            response = _png(encode_disparity_png(disparity_px)) if plain else _npy(disparity_px)
+            response = _png16(disparity_px) if plain else _npy(disparity_px)
     response.headers[RANGE_HEADER] = f"{disparity.max_disparity_px:g}"
+    return response
+
+
+def _png16(values: Plane) -> Response:
+    response = _png(encode_disparity_png(values))
+    response.headers[BEYOND_HEADER] = str(np.count_nonzero(beyond_png(values)))
     return response
 
 

@@ -213,5 +213,8 @@ async def _collected(chunks: AsyncIterator[bytes], limit: int) -> memoryview:
     async for chunk in chunks:
         body += chunk
         if len(body) > limit:
-            raise FrameTooLarge(f"expected a message of at most {limit} bytes")
+            raise FrameTooLarge(
+                f"expected a message of at most {limit} bytes; the server's setting "
+                "limits.max_frame_mib allows more"
+            )
     return memoryview(body)

@@ -44,6 +44,7 @@ class UploadLimits:
     """The limits of one upload."""
 
     max_bytes: int
+    max_bytes_setting: str  # the setting that max_bytes follows from
     idle_s: float  # abort an upload that sends nothing for this long
     min_bytes_per_s: float  # or that is slower than this for as long
     archive: ArchiveLimits
@@ -161,7 +162,10 @@ async def receive_form(
 
 
 async def _chunks(request: Request, limits: UploadLimits) -> AsyncIterator[bytes]:
-    too_large = UploadTooLarge(f"expected an upload of at most {limits.max_bytes} bytes")
+    too_large = UploadTooLarge(
+        f"expected an upload of at most {limits.max_bytes} bytes; the server's setting "
+        f"{limits.max_bytes_setting} allows more"
+    )
     if int(request.headers.get("content-length", 0)) > limits.max_bytes:
         raise too_large
     received = 0
