@@ -86,6 +86,10 @@ class ModelSettings(_Section):
     providers: tuple[Literal["cpu", "cuda", "tensorrt", "openvino"], ...] = Field(
         default=("cpu",), min_length=1, description="execution providers in order of preference"
     )
+    engine: Literal["auto", "native", "onnxruntime"] = Field(
+        default="auto",
+        description="what computes a step; auto: native for lite on a CPU, if it was built",
+    )
     threads: int = Field(
         default=0, ge=0, description="threads that all steps share; 0 uses one per core"
     )

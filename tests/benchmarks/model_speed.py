@@ -1,12 +1,13 @@
-"""What a step of lite costs beside StereoSGBM: one run, one image pair, side by side.
+"""What a step of lite costs, natively and in onnxruntime, beside StereoSGBM: one run, one pair.
 
-    python tests/benchmarks/model_speed.py --json FILE
+    python tests/benchmarks/model_speed.py --json FILE [--variant avx2]
 
-A warm step of the service's model, 640x480, batch 1, one iteration, two onnxruntime threads, with
-the settings that the service has by default; SGBM 3-way with its holes filled, at full and at half
-size. The methods take turns, so that a busy moment of the machine hits all of them. Then the first
-frame of a live stream and of one that wants every frame, by themselves. Times are medians in
-milliseconds; CPU time counts every thread of the process.
+A warm step of the service's models, 640x480, batch 1, one iteration, two threads, with the settings
+that the service has by default; SGBM 3-way with its holes filled, at full and at half size. The
+methods take turns, so that a busy moment of the machine hits all of them. Then the first frame of a
+live stream and of one that wants every frame, by themselves. Times are medians in milliseconds; CPU
+time counts every thread of the process. `--variant` makes the native step use other instructions
+than the best; onnxruntime always uses the best of this CPU (isa).
 """
 
 import argparse
@@ -22,9 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vergence_models.evaluation.sgbm import sgbm_disparity
+from vergence_native import variants
 from vergence_proto.geometry import Pose, RectifiedRig
 from vergence_proto.instruction_set import instruction_set
 from vergence_service.inference.model import Step, StereoView
+from vergence_service.inference.native_model import NativeStereoModel
 from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
 from vergence_service.settings import ModelSettings
 
@@ -73,50 +76,62 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     parser.add_argument("--weights", type=Path, default=packaged_weights_dir())
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--variant", choices=variants())
     parser.add_argument("--rounds", type=int, default=40)
     given = parser.parse_args()
     left, right = textured_pair()
     settings = ModelSettings()
-    model = OnnxStereoModel(
+    onnx = OnnxStereoModel(
         given.weights,
         "lite",
         providers=["cpu"],
         threads=given.threads,
         allow_spinning=settings.allow_spinning,
     )
+    native = NativeStereoModel(
+        given.weights,
+        "lite",
+        threads=given.threads,
+        allow_spinning=settings.allow_spinning,
+        variant=given.variant,
+    )
     view = StereoView(left, right, RIG, capture_ns=0, world_from_left=Pose.identity())
-    (cold,) = model.step([Step(view, None, max(model.card.graphs))])
+    (cold,) = native.step([Step(view, None, max(native.card.graphs))])
     warm = [Step(view, cold.state, 1)]
     found = measure(
         {
-            "lite": lambda: model.step(warm),
+            "native": lambda: native.step(warm),
+            "ort": lambda: onnx.step(warm),
             "sgbm_full": lambda: sgbm_disparity(left, right),
             "sgbm_half": lambda: sgbm_disparity(left, right, scale=0.5),
         },
         given.rounds,
     )
-    wall_ms, cpu_ms = found["lite"]
     starts = {
         "live_start_ms": settings.cold_iterations,
         "start_ms": settings.cold_iterations_every,
     }
-    counts = {name: model.card.iterations_at_most(count) for name, count in starts.items()}
+    counts = {name: native.card.iterations_at_most(count) for name, count in starts.items()}
     first_frames = measure(
         {
-            name: functools.partial(model.step, [Step(view, None, count)])
+            name: functools.partial(native.step, [Step(view, None, count)])
             for name, count in counts.items()
         },
         STARTS,
     )
     results = {
-        "lite_ms": wall_ms,
-        "lite_cpu_ms": cpu_ms,
+        "native_ms": found["native"][0],
+        "native_cpu_ms": found["native"][1],
+        "ort_ms": found["ort"][0],
+        "ort_cpu_ms": found["ort"][1],
         "sgbm_full_cpu_ms": found["sgbm_full"][1],
         "sgbm_half_cpu_ms": found["sgbm_half"][1],
-        "fps": 1e3 / wall_ms,
+        "fps": 1e3 / found["native"][0],
         **{name: start_ms for name, (start_ms, _) in first_frames.items()},
     }
-    row = {"isa": instruction_set()} | {name: round(value, 2) for name, value in results.items()}
+    row = {"isa": instruction_set(), "engine": native.engine} | {
+        name: round(value, 2) for name, value in results.items()
+    }
     sys.stdout.write(" ".join(f"{name} {value}" for name, value in row.items()) + "\n")
     if given.json:
         given.json.write_text(json.dumps(row) + "\n", "utf-8")

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
+import vergence_native
 from tests.support.mjpeg_camera import mjpeg_camera
 from tests.support.textured_wall import (
     BASELINE_M,
@@ -259,6 +260,8 @@ def test_doctor_finds_the_weights_and_a_running_server(server: str) -> None:
     assert done.returncode == 0, done.stdout
     assert "lite" in done.stdout
     assert f"{server} runs" in done.stdout
+    found = "built; it serves lite" if vergence_native.available() else "onnxruntime serves"
+    assert found in " ".join(done.stdout.split())
     # The lines of the machine and of the server, which are one.
     assert done.stdout.count(instruction_set()) >= 2
 

@@ -54,7 +54,8 @@ class Finding:
 
 async def doctor(server: str, console: Console) -> bool:
     """Print all findings; return False if a requirement of every command is not met."""
-    findings = [_python(), _cpu(), *_packages(), *_ports(), _weights(), await _reachable(server)]
+    findings = [_python(), _cpu(), *_packages(), *_ports(), _weights(), _native()]
+    findings.append(await _reachable(server))
     table = Table(show_header=False, box=None)
     for finding in findings:
         # As text: the brackets of an extra are not markup.
@@ -143,6 +144,17 @@ def _weights() -> Finding:
         f"searches {card.max_disparity_px} px"
     )
     return Finding(Verdict.GOOD, "weights", summary)
+
+
+def _native() -> Finding:
+    spec = importlib.util.find_spec("vergence_native")
+    if spec is None or spec.origin is None:
+        return Finding(Verdict.NOTE, "native step", "not installed; onnxruntime serves")
+    folder = Path(spec.origin).parent
+    if any(folder.joinpath(f"vergence_native{end}").exists() for end in (".so", ".dylib", ".dll")):
+        return Finding(Verdict.GOOD, "native step", "built; it serves lite on a CPU")
+    advice = "not built, onnxruntime serves; install gcc or clang and install vergence again"
+    return Finding(Verdict.NOTE, "native step", advice)
 
 
 async def _reachable(server: str) -> Finding:

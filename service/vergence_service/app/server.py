@@ -15,7 +15,9 @@ from vergence_service.app.http import serving_http
 from vergence_service.app.zenoh import ZenohTransport, serving_zenoh
 from vergence_service.descriptors import affordable_connections
 from vergence_service.inference.batcher import StepBatcher
+from vergence_service.inference.engines import load_model
 from vergence_service.inference.model import StereoModel
+from vergence_service.inference.native_model import NativeStereoModel
 from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
 from vergence_service.jobs.queue import JobQueue
 from vergence_service.metrics import Metrics
@@ -49,15 +51,16 @@ class Running:
     loading: asyncio.Task[None]  # of the graphs that live streams do not need
 
 
-def make_model(settings: Settings) -> OnnxStereoModel:
+def make_model(settings: Settings) -> OnnxStereoModel | NativeStereoModel:
     """Load the model card of the settings.
 
-    Raises ManifestError if the manifest cannot be used, ProviderUnavailable if an execution
-    provider is missing, and FileNotFoundError if there are no weights.
+    Raises ManifestError if the manifest cannot be used, ProviderUnavailable if the engine or an
+    execution provider is missing, and FileNotFoundError if there are no weights.
     """
-    return OnnxStereoModel(
+    return load_model(
         settings.model.weights or packaged_weights_dir(),
         settings.model.name,
+        engine=settings.model.engine,
         providers=settings.model.providers,
         threads=settings.model.threads,
         allow_spinning=settings.model.allow_spinning,

@@ -89,12 +89,13 @@ class GraphRunner:
         self._sessions: dict[Path, InferenceSession] = {}
         self._steps: dict[Stages, list[list[_Graph]]] = {}
         width = max(map(len, card.all_stages))
-        self.max_concurrent_steps = min(threads or _cores(), width)
+        threads_or_cores = threads or usable_cores()
+        self.max_concurrent_steps = min(threads_or_cores, width)
         # A model that is cut for several threads runs each graph on one thread, also in stages of
         # one graph. Two threads that shared the last graph of `lite`, operator by operator, took
         # 15 % less time but a fifth more work, and another stream's step can use the second thread
         # better. A model of one graph passes 0 on: onnxruntime itself counts the cores best.
-        self._operator_threads = max(1, (threads or _cores()) // width) if width > 1 else threads
+        self._operator_threads = max(1, threads_or_cores // width) if width > 1 else threads
         self._side_pool = ThreadPoolExecutor(self.max_concurrent_steps, thread_name_prefix="graph")
         self._running = 0
         self._counting = threading.Lock()
@@ -221,6 +222,6 @@ def _output_names(session: InferenceSession) -> tuple[str, ...]:
     return tuple(entry.name for entry in session.get_outputs())
 
 
-def _cores() -> int:
+def usable_cores() -> int:
     """Count the cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

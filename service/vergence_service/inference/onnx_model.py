@@ -88,7 +88,11 @@ class OnnxStereoModel:
     def warm_up(self, iterations: int, *cold_iterations: int) -> None:
         self._graphs.load(iterations)
         for count in cold_iterations:
-            self._graphs.load(count, cold_pixels=0)
+            self.load_cold(count)
+
+    def load_cold(self, iterations: int) -> None:
+        """Load the graphs of cold starts with this count."""
+        self._graphs.load(iterations, cold_pixels=0)
 
     def step_bytes(self, height: int, width: int, iterations: int, *, cold: bool) -> int:
         height, width = self._card.step_size(height, width)

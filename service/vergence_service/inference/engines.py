@@ -1,0 +1,48 @@
+"""The choice of the engine that computes a model."""
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+from vergence_service.inference.native_model import NativeStereoModel
+from vergence_service.inference.onnx_model import OnnxStereoModel
+from vergence_service.inference.providers import ProviderUnavailable
+
+log = logging.getLogger(__name__)
+
+NATIVE_MODEL = "lite"  # the model that the native engine has kernels for
+
+
+def load_model(
+    weights_dir: Path,
+    name: str,
+    *,
+    engine: str,
+    providers: Sequence[str],
+    threads: int,
+    allow_spinning: bool,
+) -> OnnxStereoModel | NativeStereoModel:
+    """Load a model into ``engine``: "auto", "native" or "onnxruntime".
+
+    "auto" is native for `lite` on a CPU, if the library is there and knows the weights.
+
+    Raises ManifestError if the manifest cannot be used, and ProviderUnavailable if the engine or
+    its execution provider cannot be used.
+    """
+    if engine == "native" and providers[0] != "cpu":
+        raise ProviderUnavailable(
+            f"the native engine runs on the CPU; set model.providers to cpu, not {providers[0]!r}, "
+            "or model.engine to onnxruntime"
+        )
+    if engine == "native" or (engine == "auto" and name == NATIVE_MODEL and providers[0] == "cpu"):
+        try:
+            return NativeStereoModel(
+                weights_dir, name, threads=threads, allow_spinning=allow_spinning
+            )
+        except ProviderUnavailable as error:
+            if engine == "native":
+                raise
+            log.info("onnxruntime computes %s: %s", name, error)
+    return OnnxStereoModel(
+        weights_dir, name, providers=providers, threads=threads, allow_spinning=allow_spinning
+    )
