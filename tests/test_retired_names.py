@@ -52,7 +52,7 @@ RETIRED = {
     "looks_closer": "refines_at_2x",
     "next_due": "next_expected",
     "on_zenoh": "serving_zenoh",
-    "open_apart": "open_offline",
+    "open_apart": "offline",
     "opening_of": "job_stream_config",
     "partly_foreign": "cutmix_state",
     "put_away": "finish",

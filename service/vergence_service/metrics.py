@@ -46,8 +46,14 @@ class Metrics:
             "Live streams whose next frame is predicted",
             registry=registry,
         )
-        self.state_bytes = Gauge(
-            "vergence_state_bytes", "Memory reserved for recurrent states", registry=registry
+        self.memory_bytes = Gauge(
+            "vergence_memory_bytes",
+            "Memory reserved for streams",
+            ["kind"],
+            registry=registry,
+        )
+        self.memory_limit_bytes = Gauge(
+            "vergence_memory_limit_bytes", "Limit of all kinds together", registry=registry
         )
         self.pairs = Gauge(
             "vergence_pairs", "Single pairs that wait or are stepped", registry=registry

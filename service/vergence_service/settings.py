@@ -138,8 +138,12 @@ class LimitSettings(_Section):
     max_frame_mib: PositiveInt = Field(
         default=32, description="largest message with one frame or one answer"
     )
+    max_side_px: PositiveInt = Field(
+        default=4096, description="largest width or height of an image"
+    )
     max_state_mib: PositiveInt = Field(
-        default=512, description="memory for the recurrent states of all streams together"
+        default=1024,
+        description="memory of all streams: states, steps, images, maps and waiting frames",
     )
     connections: PositiveInt = Field(
         default=256,

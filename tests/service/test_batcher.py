@@ -17,17 +17,24 @@ from vergence_proto.geometry import RectifiedRig
 from vergence_proto.types import Timings
 from vergence_service.inference.batcher import StepBatcher
 from vergence_service.inference.model import Step, StepResult, StereoView
+from vergence_service.memory import MemoryBudget
 from vergence_service.metrics import Metrics
 
 
 def make_batcher(
-    model: RecallModel, *, max_batch: int = 8, clock: ManualClock | None = None
+    model: RecallModel,
+    *,
+    max_batch: int = 8,
+    memory_bytes: int = 1 << 30,
+    clock: ManualClock | None = None,
 ) -> StepBatcher:
+    metrics = Metrics(CollectorRegistry())
     return StepBatcher(
         model,
         max_batch=max_batch,
+        memory=MemoryBudget(memory_bytes, metrics=metrics),
         clock=clock or ManualClock(),
-        metrics=Metrics(CollectorRegistry()),
+        metrics=metrics,
     )
 
 

@@ -3,17 +3,23 @@
 import asyncio
 
 import pytest
+from prometheus_client import CollectorRegistry
 
 from vergence_proto.codec import ReceivedFrame
 from vergence_proto.errors import FrameOutOfOrder
 from vergence_proto.types import Delivery
 from vergence_proto.v1 import depth_pb2 as pb
+from vergence_service.memory import MemoryBudget
+from vergence_service.metrics import Metrics
 from vergence_service.transports.mailbox import Mailbox, QueuedFrame
+
+BUDGET = MemoryBudget(1 << 20, metrics=Metrics(CollectorRegistry()))
 
 
 def queued(frame_id: int) -> QueuedFrame:
     frame = pb.Frame(frame_id=frame_id, capture_ns=frame_id * 1000)
-    return QueuedFrame(ReceivedFrame.of(frame), arrived_s=float(frame_id))
+    memory = BUDGET.hold_frame(1)
+    return QueuedFrame(ReceivedFrame.of(frame), arrived_s=float(frame_id), memory=memory)
 
 
 async def test_of_live_frames_the_newest_is_taken_and_each_other_given_back() -> None:

@@ -24,10 +24,12 @@ from vergence_proto.errors import NotReady
 from vergence_proto.types import Delivery, StereoRig
 from vergence_service.inference.batcher import StepBatcher
 from vergence_service.jobs.store import JobStore, StoreInUse
+from vergence_service.memory import MemoryBudget
 from vergence_service.metrics import Metrics
 from vergence_service.streams import engine as engine_module
 from vergence_service.streams.continuity import ContinuityLimits
 from vergence_service.streams.engine import DepthEngine
+from vergence_service.streams.needs import ImageSizes
 from vergence_service.streams.stream import StreamConfig
 from vergence_service.streams.table import StreamTable
 from vergence_service.threads import Threads
@@ -114,11 +116,12 @@ async def test_an_early_client_sees_that_the_server_loads_and_is_served_when_it_
 async def not_started() -> AsyncIterator[DepthEngine]:
     """An engine whose model is not loaded."""
     model, metrics, clock = RecallModel(), Metrics(CollectorRegistry()), ManualClock()
-    batcher = StepBatcher(model, max_batch=1, clock=clock, metrics=metrics)
+    memory = MemoryBudget(1 << 30, metrics=metrics)
+    batcher = StepBatcher(model, max_batch=1, memory=memory, clock=clock, metrics=metrics)
     streams = StreamTable(
         capacity=1,
         per_client=None,
-        max_state_bytes=1 << 20,
+        memory=memory,
         idle_timeout_s=60,
         idle_notice_s=10,
         detach_grace_s=10,
@@ -131,11 +134,12 @@ async def not_started() -> AsyncIterator[DepthEngine]:
         yield DepthEngine(
             streams,
             batcher,
-            card=model.card,
+            model=model,
+            memory=memory,
             iterations=1,
             cold_iterations=dict.fromkeys(Delivery, 4),
             limits=ContinuityLimits(max_gap_s=1, max_jump_m=1, max_jump_deg=45),
-            max_pixels=RIG.width * RIG.height,
+            sizes=ImageSizes(max_pixels=RIG.width * RIG.height, max_side=RIG.width),
             min_range_share=0.0,
             clock=clock,
             metrics=metrics,

@@ -19,6 +19,7 @@ from vergence_proto.errors import (
     UnknownStream,
 )
 from vergence_proto.types import StereoRig
+from vergence_service.memory import MemoryBudget, MemoryKind, StreamMemory
 from vergence_service.metrics import Metrics
 from vergence_service.streams.rectify import Rectifier
 from vergence_service.streams.stream import Notice, Stream, StreamConfig
@@ -68,16 +69,18 @@ class StreamTableMachine(RuleBasedStateMachine):
         self.registry = CollectorRegistry()
         self.opened: list[Stream] = []
         self.closed: list[Stream] = []
+        metrics = Metrics(self.registry)
+        self.memory = MemoryBudget(MEMORY, metrics=metrics)
         self.table = StreamTable(
             capacity=CAPACITY,
             per_client=PER_CLIENT,
-            max_state_bytes=MEMORY,
+            memory=self.memory,
             idle_timeout_s=IDLE_S,
             idle_notice_s=NOTICE_S,
             detach_grace_s=GRACE_S,
             silent_s=SILENT_S,
             clock=self.clock,
-            metrics=Metrics(self.registry),
+            metrics=metrics,
             on_closed=self.closed.append,
         )
         # What the table should hold: per open stream its size, whose it is and since when it is
@@ -114,14 +117,9 @@ class StreamTableMachine(RuleBasedStateMachine):
     def open_in_table(
         self, stream_id: str, size: int, client: str, connection: Connection
     ) -> Stream:
-        return self.table.open(
-            stream_id,
-            RIG_OPENING,
-            RECTIFIER,
-            state_bytes=size,
-            attachment=connection,
-            client=client,
-        )
+        need = StreamMemory(state=size, work=0, maps=0, step=0)
+        with self.table.reserve(stream_id, need, client=client) as place:
+            return self.table.open(place, RIG_OPENING, RECTIFIER, attachment=connection)
 
     @rule(
         target=connections,
@@ -160,6 +158,22 @@ class StreamTableMachine(RuleBasedStateMachine):
 
     def count(self, client: str) -> int:
         return [*self.clients.values(), *self.leaving.values()].count(client)
+
+    @rule(stream_id=st.sampled_from("abcde"), other_id=st.sampled_from("fgh"))
+    def give_up_while_it_opens(self, stream_id: str, other_id: str) -> None:
+        self.table.sweep()
+        self.settle()
+        need = StreamMemory(state=1, work=0, maps=0, step=0)
+        taken = len(self.sizes) + len(self.leaving)
+        if stream_id in self.sizes or taken >= CAPACITY or sum(self.sizes.values()) >= MEMORY:
+            return
+        with self.table.reserve(stream_id, need, client=""):
+            assert self.memory.used(MemoryKind.STATE) == sum(self.sizes.values()) + 1
+            with pytest.raises(StreamExists), self.table.reserve(stream_id, need, client=""):
+                pass
+            if taken + 1 == CAPACITY:
+                with pytest.raises(StreamLimit), self.table.reserve(other_id, need, client=""):
+                    pass
 
     @rule(stream_id=st.sampled_from("abcde"))
     def use(self, stream_id: str) -> None:
@@ -239,7 +253,7 @@ class StreamTableMachine(RuleBasedStateMachine):
         self.settle()
         assert len(self.table) == len(self.sizes)
         assert self.registry.get_sample_value("vergence_streams_open") == len(self.sizes)
-        assert self.registry.get_sample_value("vergence_state_bytes") == sum(self.sizes.values())
+        assert self.memory.used(MemoryKind.STATE) == sum(self.sizes.values())
         for stream_id, stream in self.streams.items():
             owner = self.owner[stream_id]
             assert stream.attachment is owner

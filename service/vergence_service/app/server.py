@@ -20,10 +20,12 @@ from vergence_service.inference.model import StereoModel
 from vergence_service.inference.native_model import NativeStereoModel
 from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
 from vergence_service.jobs.queue import JobQueue
+from vergence_service.memory import MemoryBudget, affordable_bytes
 from vergence_service.metrics import Metrics
 from vergence_service.settings import Settings
 from vergence_service.streams.continuity import ContinuityLimits
 from vergence_service.streams.engine import DepthEngine
+from vergence_service.streams.needs import ImageSizes
 from vergence_service.streams.table import StreamTable
 from vergence_service.threads import Threads
 from vergence_service.transports.addresses import format_address
@@ -79,11 +81,14 @@ async def running(
     """
     registry = CollectorRegistry()
     metrics = Metrics(registry)
-    batcher = StepBatcher(model, max_batch=settings.model.max_batch, clock=clock, metrics=metrics)
+    memory = MemoryBudget(settings.limits.max_state_mib * _MIB, metrics=metrics)
+    batcher = StepBatcher(
+        model, max_batch=settings.model.max_batch, memory=memory, clock=clock, metrics=metrics
+    )
     streams = StreamTable(
         capacity=settings.streams.capacity,
         per_client=settings.limits.streams_per_client,
-        max_state_bytes=settings.limits.max_state_mib * _MIB,
+        memory=memory,
         idle_timeout_s=settings.streams.idle_timeout_s,
         idle_notice_s=settings.streams.idle_notice_s,
         detach_grace_s=settings.streams.detach_grace_s,
@@ -96,14 +101,17 @@ async def running(
     engine = DepthEngine(
         streams,
         batcher,
-        card=model.card,
+        model=model,
+        memory=memory,
         iterations=settings.model.iterations,
         cold_iterations={
             Delivery.NEWEST: settings.model.cold_iterations,
             Delivery.EVERY: settings.model.cold_iterations_every,
         },
         limits=ContinuityLimits(**settings.continuity.model_dump()),
-        max_pixels=settings.limits.max_pixels,
+        sizes=ImageSizes(
+            max_pixels=settings.limits.max_pixels, max_side=settings.limits.max_side_px
+        ),
         min_range_share=settings.model.min_range_share,
         clock=clock,
         metrics=metrics,
@@ -150,6 +158,7 @@ async def running(
         _in_background(_sweep(streams)),
     ):
         await engine.start()
+        memory.reduce_to(affordable_bytes(settings.limits.max_state_mib * _MIB))
         await grpc_server.serving()
         if zenoh is not None:
             await zenoh.server.serving()

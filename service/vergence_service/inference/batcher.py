@@ -17,6 +17,7 @@ from vergence_proto.errors import DepthError, Draining, FrameStale, ModelFailed
 from vergence_proto.types import Timings
 from vergence_service.inference.arrivals import ArrivalPredictor
 from vergence_service.inference.model import Step, StepResult, StereoModel
+from vergence_service.memory import MemoryBudget
 from vergence_service.metrics import Metrics
 
 log = logging.getLogger(__name__)
@@ -56,6 +57,8 @@ class StepBatcher:
     would delay a live frame (running or expected soon) waits, at most ``_PATIENCE_S``. Of several
     lanes, one is never taken by such steps while there are live streams.
 
+    Steps run side by side only in the memory that ``memory`` has left.
+
     Every waiter gets a result or an exception: ModelFailed, NonFinite, FrameStale, or Draining if
     the batcher ends first. A caller must never have two steps of one stream waiting.
     """
@@ -65,6 +68,7 @@ class StepBatcher:
         model: StereoModel,
         *,
         max_batch: int,
+        memory: MemoryBudget,
         clock: Callable[[], float],
         metrics: Metrics,
     ) -> None:
@@ -73,6 +77,7 @@ class StepBatcher:
         self._lanes = lanes
         # In a batch the first row would wait for the last while another lane is free.
         self._max_batch = max_batch if lanes == 1 else 1
+        self._memory = memory
         self._clock = clock
         self._metrics = metrics
         self._waiting: list[_Waiting] = []
@@ -140,7 +145,8 @@ class StepBatcher:
                 lanes.create_task(self._in_lane(batch))
 
     async def _in_lane(self, batch: list[_Waiting]) -> None:
-        await self._step_together(batch)
+        with self._memory.stepping(self._bytes_of(batch)):
+            await self._step_together(batch)
         # Not reached when cancelled: __aexit__ then answers the steps that have no answer.
         self._in_model = [item for item in self._in_model if item not in batch]
         self._free_lanes.release()
@@ -151,12 +157,19 @@ class StepBatcher:
         while True:
             batch = self._oldest()
             hold_s = self._hold_s(batch[0]) if batch else None
+            if hold_s == 0 and not self._memory.may_step(self._bytes_of(batch)):
+                hold_s = None  # until another step has ended
             if hold_s == 0:
                 self._waiting = [item for item in self._waiting if item not in batch]
                 return batch
             self._changed.clear()
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._changed.wait(), hold_s)
+
+    def _bytes_of(self, batch: Sequence[_Waiting]) -> int:
+        step = batch[0].step
+        height, width = step.view.left.shape[:2]
+        return len(batch) * self._model.step_bytes(height, width, step.iterations, cold=step.cold)
 
     def _hold_s(self, first: _Waiting) -> float:
         """Return the time that ``first`` must wait so that it delays no live frame."""

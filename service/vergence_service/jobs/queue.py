@@ -13,6 +13,7 @@ from vergence_service.jobs.job import Job, JobOptions
 from vergence_service.jobs.progress import JobStatus
 from vergence_service.jobs.registry import JobRegistry
 from vergence_service.jobs.results import result_bytes
+from vergence_service.jobs.run import job_stream_config
 from vergence_service.jobs.sources import find_sequence
 from vergence_service.jobs.store import JobStore, folder_bytes, remove_folder
 from vergence_service.jobs.upload_checks import checking_folder
@@ -121,7 +122,7 @@ class JobQueue:
         )
         chosen, sequence = await self.threads.run(find_sequence, folder / "input", source)
         # Refuse now what could not be opened when the job runs.
-        await self._engine.check_offline(sequence.rig)
+        await self._engine.check_offline(job_stream_config(sequence, options))
         uploaded = await self.threads.run(folder_bytes, folder)
         job = Job(
             job_id=secrets.token_hex(8),

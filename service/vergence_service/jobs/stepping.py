@@ -3,13 +3,14 @@
 from collections.abc import AsyncGenerator
 from contextlib import aclosing
 from dataclasses import dataclass
+from functools import partial
 
 from vergence_proto.datasets import SourceFrame, StereoSource, read_ahead
 from vergence_proto.ordered import in_order
 from vergence_proto.types import DisparityMap
 from vergence_service.inference.model import RecurrentState
 from vergence_service.streams.engine import DepthEngine
-from vergence_service.streams.stream import StreamConfig
+from vergence_service.streams.stream import Stream, StreamConfig
 
 # One frame is in the model while the map of the frame before is made.
 _IN_FLIGHT = 2
@@ -41,18 +42,18 @@ async def step_all(
     BadShape, ModelFailed or NonFinite if a frame cannot be stepped; and DatasetError if a file
     cannot be read.
     """
-    stream = await engine.open_offline(config, state=state)
-
-    async def step(frame: tuple[int, SourceFrame]) -> Stepped:
-        index, source = frame
-        disparity, state = await engine.step_offline(stream, lambda: source.frame)
-        return Stepped(index, source, disparity, state)
-
     async with (
+        engine.offline(config, state=state) as stream,
         aclosing(
             read_ahead(sequence, start=start, in_thread=engine.threads.background.run)
         ) as frames,
-        aclosing(in_order(frames, step, limit=_IN_FLIGHT)) as steps,
+        aclosing(in_order(frames, partial(_step, engine, stream), limit=_IN_FLIGHT)) as steps,
     ):
         async for stepped in steps:
             yield stepped
+
+
+async def _step(engine: DepthEngine, stream: Stream, frame: tuple[int, SourceFrame]) -> Stepped:
+    index, source = frame
+    disparity, state = await engine.step_offline(stream, lambda: source.frame)
+    return Stepped(index, source, disparity, state)

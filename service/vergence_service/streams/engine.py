@@ -1,20 +1,18 @@
 """The engine: open a stream, step it frame by frame, close it."""
 
 import asyncio
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager, suppress
 from enum import Enum
 
 from vergence_proto.errors import (
     DepthError,
     Draining,
-    FrameTooLarge,
     ModelChanged,
     NonFinite,
     NotReady,
     UnknownStream,
 )
-from vergence_proto.model_io import ModelCard
 from vergence_proto.types import (
     Delivery,
     DisparityMap,
@@ -24,10 +22,12 @@ from vergence_proto.types import (
     Timings,
 )
 from vergence_service.inference.batcher import StepBatcher
-from vergence_service.inference.model import RecurrentState, Step, StereoView, state_bytes
+from vergence_service.inference.model import RecurrentState, Step, StereoModel, StereoView
+from vergence_service.memory import MemoryBudget, StreamMemory
 from vergence_service.metrics import Metrics
 from vergence_service.streams.continuity import ContinuityLimits
 from vergence_service.streams.conversion import SteppedFrame, view_from_frame
+from vergence_service.streams.needs import ImageSizes, stream_memory
 from vergence_service.streams.rectify import Rectifier, check_rig
 from vergence_service.streams.search_window import SearchReach
 from vergence_service.streams.stream import Attachment, Notice, NoticeKind, Stream, StreamConfig
@@ -58,26 +58,30 @@ class DepthEngine:
         streams: StreamTable,
         batcher: StepBatcher,
         *,
-        card: ModelCard,
+        model: StereoModel,
+        memory: MemoryBudget,
         iterations: int,
         cold_iterations: Mapping[Delivery, int],
         limits: ContinuityLimits,
-        max_pixels: int,
+        sizes: ImageSizes,
         min_range_share: float,
         clock: Callable[[], float],
         metrics: Metrics,
         threads: Threads,
     ) -> None:
         self.streams = streams
-        self.card = card
-        self.max_pixels = max_pixels
+        self.card = model.card
+        self.memory = memory
+        self.max_pixels = sizes.max_pixels
         self.metrics = metrics
         self.threads = threads
         self._batcher = batcher
+        self._model = model
+        self._sizes = sizes
         self._iterations = iterations
         self._cold_iterations = cold_iterations
         self._limits = limits
-        self._reach = SearchReach(card.max_disparity_px, min_range_share)
+        self._reach = SearchReach(self.card.max_disparity_px, min_range_share)
         self._clock = clock
         self._phase = _Phase.LOADING
         self._started = asyncio.Event()
@@ -127,18 +131,10 @@ class DepthEngine:
         StreamExists if it is in use, and Quota, StreamLimit or StateMemory if a limit is reached.
         """
         self._check_model(config)
-        await self._check_opening(config.rig)
-        rectifier = await self._rectifier(config.rig)
-        searched = rectifier.window.rig
-        reserve = state_bytes(self.card, searched.height, searched.width)
-        return self.streams.open(
-            stream_id,
-            config,
-            rectifier,
-            state_bytes=reserve,
-            attachment=attachment,
-            client=client,
-        )
+        need = await self._check_opening(config)
+        with self.streams.reserve(stream_id, need, client=client) as place:
+            rectifier = await self._rectifier(config.rig)
+            return self.streams.open(place, config, rectifier, attachment=attachment)
 
     def resume(
         self,
@@ -190,33 +186,45 @@ class DepthEngine:
         finally:
             self.streams.touch(stream)  # a step may take longer than the idle timeout
 
-    async def check_offline(self, rig: StereoRig) -> None:
-        """Refuse what :meth:`open_offline` would refuse, with the same errors."""
-        await self._check_opening(rig)
-        await self.threads.background.run(check_rig, rig, self._reach)
+    async def check_offline(self, config: StreamConfig) -> None:
+        """Refuse what :meth:`offline` would refuse, with the same errors."""
+        self.memory.check_possible(await self._check_opening(config))
+        await self.threads.background.run(check_rig, config.rig, self._reach)
 
-    async def open_offline(
+    @asynccontextmanager
+    async def offline(
         self, config: StreamConfig, *, state: RecurrentState | None = None
-    ) -> Stream:
+    ) -> AsyncIterator[Stream]:
         """Open a stream without a client, for a sequence whose frames are all known.
 
-        The stream is not in the table: it takes no place from live streams, and ends with its last
-        reference. It continues from ``state``, the state after earlier frames.
+        The stream lasts as long as the block, and is not in the table: it takes no place from live
+        streams. It waits for its memory. It continues from ``state``, the state after earlier
+        frames.
 
         Raises NotReady or Draining if no streams are accepted, BadCalibration if the rig cannot be
         rectified, and FrameTooLarge if its images are too large.
         """
-        await self._check_opening(config.rig)
-        rectifier = await self._rectifier(config.rig)
-        origin = Origin.COLD_START if state is None else Origin.WARM
-        return Stream(
-            "", "", b"", config, rectifier, 0, None, self._clock(), state=state, origin=origin
-        )
+        need = await self._check_opening(config)
+        with await self.memory.wait_for_stream(need) as memory:
+            rectifier = await self._rectifier(config.rig)
+            origin = Origin.COLD_START if state is None else Origin.WARM
+            yield Stream(
+                "",
+                "",
+                b"",
+                config,
+                rectifier,
+                memory,
+                None,
+                self._clock(),
+                state=state,
+                origin=origin,
+            )
 
     async def step_offline(
         self, stream: Stream, decode: Callable[[], StereoFrame]
     ) -> tuple[DisparityMap, RecurrentState]:
-        """Advance a stream of :meth:`open_offline`; return the map and the state after the frame.
+        """Advance a stream of :meth:`offline`; return the map and the state after the frame.
 
         Raises what ``decode`` raises, BadShape or FrameOutOfOrder if the frame is refused,
         ModelFailed, NonFinite and Draining.
@@ -274,17 +282,19 @@ class DepthEngine:
                 "continue with these"
             )
 
-    async def _check_opening(self, rig: StereoRig) -> None:
+    async def _check_opening(self, config: StreamConfig) -> StreamMemory:
         with suppress(TimeoutError):
             async with asyncio.timeout(_LOADING_PATIENCE_S):
                 await self._started.wait()
         self._check_serving()
-        width, height = rig.left.width, rig.left.height
-        if width * height > self.max_pixels:
-            raise FrameTooLarge(
-                f"expected at most {self.max_pixels} pixels per image, got {width}x{height}; "
-                "send smaller images, or start the server with a larger limits.max_pixels"
-            )
+        self._sizes.check(config.rig)
+        return stream_memory(
+            config.rig,
+            self._model,
+            self._reach,
+            warm_iterations=self._iterations_of(config, cold=False),
+            cold_iterations=self._iterations_of(config, cold=True),
+        )
 
     async def _rectifier(self, rig: StereoRig) -> Rectifier:
         return await self.threads.background.run(Rectifier.of, rig, self._reach)

@@ -18,6 +18,10 @@ class SearchReach:
     max_disparity_px: int  # the model searches offsets from 0 to this
     min_width_share: float  # the least range of a large image, as a share of its width; 0: none
 
+    def reduction(self, width: int) -> int:
+        """Return the factor by which images of this width are reduced for the search."""
+        return max(1, math.ceil(self.min_width_share * width / self.max_disparity_px))
+
 
 @dataclass(frozen=True, slots=True)
 class SearchWindow:
@@ -36,8 +40,7 @@ class SearchWindow:
     @classmethod
     def of(cls, rig: RectifiedRig, reach: SearchReach) -> Self:
         shift = math.floor(rig.offset_of_zero_disparity_px)
-        share = reach.min_width_share * rig.width / reach.max_disparity_px
-        reduction = max(1, math.ceil(share))
+        reduction = reach.reduction(rig.width)
         shifted = replace(rig, cx_right=rig.cx_right + shift)
         beyond_zero_px = shifted.offset_of_zero_disparity_px
         return cls(

@@ -9,6 +9,7 @@ from vergence_proto.errors import DepthError, FrameOutOfOrder
 from vergence_proto.geometry import Axes
 from vergence_proto.types import Delivery, Origin, OutputFormat, StereoRig
 from vergence_service.inference.model import RecurrentState, StereoView
+from vergence_service.memory import MemoryHold
 from vergence_service.streams.continuity import ContinuityLimits, break_between
 from vergence_service.streams.rectify import Rectifier
 
@@ -82,7 +83,7 @@ class Stream:
     resume_token: bytes
     config: StreamConfig
     rectifier: Rectifier
-    state_bytes: int  # memory reserved for the state
+    memory: MemoryHold  # what is reserved for it
     attachment: Attachment | None
     active_s: float  # time of the last frame, attachment or detachment
     state: RecurrentState | None = None

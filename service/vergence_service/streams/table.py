@@ -2,7 +2,9 @@
 
 import hmac
 import secrets
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,12 +19,22 @@ from vergence_proto.errors import (
     UnknownStream,
 )
 from vergence_proto.types import Origin, StereoRig, checked_stream_id
+from vergence_service.memory import MemoryBudget, MemoryHold, StreamMemory
 from vergence_service.metrics import Metrics
 from vergence_service.streams.rectify import Rectifier
 from vergence_service.streams.stream import Attachment, Notice, NoticeKind, Stream, StreamConfig
 
 # The server remembers for this long that a stream expired, and reports it as such.
 _TOMBSTONE_S = 300.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Place:
+    """A place that is reserved for a stream."""
+
+    stream_id: str
+    client: str
+    memory: MemoryHold
 
 
 class StreamTable:
@@ -36,7 +48,7 @@ class StreamTable:
         *,
         capacity: int,
         per_client: int | None,
-        max_state_bytes: int,
+        memory: MemoryBudget,
         idle_timeout_s: float,
         idle_notice_s: float,
         detach_grace_s: float,
@@ -49,13 +61,14 @@ class StreamTable:
         self.idle_timeout_s = idle_timeout_s
         self.detach_grace_s = detach_grace_s
         self._per_client = per_client
-        self._max_state_bytes = max_state_bytes
+        self._memory = memory
         self._idle_notice_s = idle_notice_s
         self._silent_s = silent_s
         self._clock = clock
         self._metrics = metrics
         self._on_closed = on_closed
         self._streams: dict[str, Stream] = {}
+        self._opening: dict[str, str] = {}  # reserved places: the client of each stream id
         self._expired_s: dict[str, float] = {}  # tombstones
         # Connections that have lost their stream and must end, and the client of each. They count
         # towards the limits until they have ended.
@@ -67,63 +80,74 @@ class StreamTable:
     def attachments(self) -> Iterable[Attachment]:
         return [stream.attachment for stream in self._streams.values() if stream.attachment]
 
-    def open(
-        self,
-        stream_id: str,
-        config: StreamConfig,
-        rectifier: Rectifier,
-        *,
-        state_bytes: int,
-        attachment: Attachment | None,
-        client: str,
-    ) -> Stream:
-        """Open a stream. If the id is empty, the server chooses one.
+    @contextmanager
+    def reserve(self, stream_id: str, need: StreamMemory, *, client: str) -> Iterator[Place]:
+        """Reserve a place for a stream, to be used in the block. If the id is empty, choose one.
 
-        Raises BadShape if the id is not allowed, StreamExists if it is in use, and Quota,
-        StreamLimit or StateMemory if a limit is reached.
+        What takes long to make for a stream is made in this block, so that no refused opening
+        costs more than a look at the limits.
+
+        Raises BadShape if the id is not allowed, StreamExists if it is in use, FrameTooLarge if the
+        stream needs more than all memory, and Quota, StreamLimit or StateMemory if a limit is
+        reached.
         """
         self.sweep()
         stream_id = stream_id or f"s-{secrets.token_hex(8)}"
         checked_stream_id(stream_id)
-        if stream_id in self._streams:
+        if stream_id in self._streams or stream_id in self._opening:
             raise StreamExists(
                 f"stream {stream_id!r} is open; resume it with its token, close it, or choose "
                 "another id"
             )
         theirs = [each for each in self._streams.values() if client and each.client == client]
-        count = len(theirs) + (list(self._leaving.values()).count(client) if client else 0)
+        others = [*self._leaving.values(), *self._opening.values()]
+        count = len(theirs) + (others.count(client) if client else 0)
         if self._per_client is not None and count >= self._per_client:
             raise Quota(
                 f"{client} has {count} open streams, the limit per client; close one, or "
                 "try again later (the server's setting limits.streams_per_client)",
                 retry_after_s=self._next_expiry_s(theirs),
             )
-        if len(self._streams) + len(self._leaving) >= self.capacity:
+        if len(self._streams) + len(others) >= self.capacity:
             raise StreamLimit(
                 f"the server has {self.capacity} open streams, its limit; close one, or "
                 "try again later (the server's setting streams.capacity)",
                 retry_after_s=self._next_expiry_s(self._streams.values()),
             )
-        reserved = self._reserved_bytes()
-        if reserved + state_bytes > self._max_state_bytes:
-            raise StateMemory(
-                f"the stream's state needs {state_bytes} bytes; {reserved} of "
-                f"{self._max_state_bytes} are in use; close a stream, or try again later (the "
-                "server's setting limits.max_state_mib)",
-                retry_after_s=self._next_expiry_s(self._streams.values()),
-            )
-        self._expired_s.pop(stream_id, None)
+        try:
+            place = Place(stream_id, client, self._memory.hold_stream(need))
+        except StateMemory as error:
+            error.retry_after_s = self._next_expiry_s(self._streams.values())
+            raise
+        self._opening[stream_id] = client
+        try:
+            yield place
+        finally:
+            del self._opening[stream_id]
+            if stream_id not in self._streams:
+                place.memory.release()
+
+    def open(
+        self,
+        place: Place,
+        config: StreamConfig,
+        rectifier: Rectifier,
+        *,
+        attachment: Attachment | None,
+    ) -> Stream:
+        """Open a stream at a place that :meth:`reserve` has reserved."""
+        self._expired_s.pop(place.stream_id, None)
         stream = Stream(
-            stream_id,
-            client,
+            place.stream_id,
+            place.client,
             secrets.token_bytes(16),
             config,
             rectifier,
-            state_bytes,
+            place.memory,
             attachment,
             self._clock(),
         )
-        self._streams[stream_id] = stream
+        self._streams[place.stream_id] = stream
         self._count()
         return stream
 
@@ -194,6 +218,7 @@ class StreamTable:
         """End a stream, and free its state and what was learnt about it."""
         if self._streams.get(stream.stream_id) is stream:
             del self._streams[stream.stream_id]
+            stream.memory.release()
             if stream.attachment is not None:
                 self._leaving[stream.attachment] = stream.client
             self._count()
@@ -247,12 +272,8 @@ class StreamTable:
         # Without a stream, only connections that are about to end are in the way.
         return min(map(self._expiry_s, streams), default=self._clock() + 1.0) - self._clock()
 
-    def _reserved_bytes(self) -> int:
-        return sum(stream.state_bytes for stream in self._streams.values())
-
     def _count(self) -> None:
         self._metrics.streams_open.set(len(self._streams))
-        self._metrics.state_bytes.set(self._reserved_bytes())
 
 
 def _in_use(stream: Stream) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from vergence_proto.codec import ReceivedFrame
 from vergence_proto.errors import FrameOutOfOrder
 from vergence_proto.types import Delivery
+from vergence_service.memory import MemoryHold
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -15,6 +16,7 @@ class QueuedFrame:
 
     frame: ReceivedFrame
     arrived_s: float
+    memory: MemoryHold
     reset_before: bool = False  # the client asked for a reset just before this frame
 
     @property
@@ -62,6 +64,12 @@ class Mailbox:
     def reset(self) -> None:
         """Mark the next frame: the stream starts again without a state before it."""
         self._reset_asked = True
+
+    def discard(self) -> None:
+        """Forget the frames that wait, and give their memory back."""
+        for queued in self._frames:
+            queued.memory.release()
+        self._frames.clear()
 
     async def finish(self) -> None:
         """Accept no more frames; waiting frames can still be taken."""

@@ -6,6 +6,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from vergence_proto.codec import Request
 from vergence_proto.errors import Draining
 from vergence_proto.v1 import depth_pb2 as pb
+from vergence_service.memory import MemoryBudget
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.transports.stream_call import DepthCall, StreamLimits
 
@@ -43,6 +44,11 @@ class OpenCalls:
             limits=self.limits,
             clock=self._clock,
         )
+
+    @property
+    def memory(self) -> MemoryBudget:
+        """The budget of everything that clients make the server keep."""
+        return self._engine.memory
 
     async def run(self, call: DepthCall) -> None:
         """Serve the call to its end. Raises the DepthError that it ends with, or ClientLost."""

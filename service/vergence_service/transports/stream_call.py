@@ -7,6 +7,7 @@ from functools import partial
 
 from vergence_proto import codec
 from vergence_proto.errors import DepthError, StreamExists, UnknownStream
+from vergence_proto.types import Delivery
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.stream import Notice, Stream, StreamConfig
@@ -139,6 +140,8 @@ class DepthCall:
             [first, *_] = group.exceptions
             assert isinstance(first, ClientLost)  # a task of the group raised it
             lost = first
+        finally:
+            mailbox.discard()
         if lost is not None:
             raise lost
 
@@ -228,14 +231,30 @@ class DepthCall:
             codec.check_frame(
                 frame, size=(rig.width, rig.height), max_bytes=self._limits.max_frame_bytes
             )
-            displaced = await mailbox.put(QueuedFrame(frame, arrived_s))
+            displaced = await self._keep(stream, mailbox, frame, arrived_s)
         except DepthError as error:
             self._engine.count_failed(stream, error)
             await self._refuse(frame.frame_id, error)
             return
         if displaced is not None:
+            displaced.memory.release()
             await self._drop(stream, [displaced.frame_id])
             self._answered()
+
+    async def _keep(
+        self, stream: Stream, mailbox: Mailbox, frame: codec.ReceivedFrame, arrived_s: float
+    ) -> QueuedFrame | None:
+        """Put a frame into the mailbox; return the frame that it displaced, if any."""
+        budget = self._engine.memory
+        live = stream.config.delivery is Delivery.NEWEST
+        memory = (
+            budget.hold_frame(frame.nbytes) if live else await budget.wait_for_frame(frame.nbytes)
+        )
+        try:
+            return await mailbox.put(QueuedFrame(frame, arrived_s, memory))
+        except BaseException:
+            memory.release()
+            raise
 
     async def _drop(self, stream: Stream, frame_ids: Sequence[int]) -> None:
         for _ in frame_ids:
@@ -265,6 +284,8 @@ class DepthCall:
             else:
                 await self._outbox.put_map(stepped)
                 self._answered()
+            finally:
+                queued.memory.release()
 
     async def _refuse(self, frame_id: int, error: DepthError) -> None:
         message = codec.error_to_frame_error(frame_id, error)

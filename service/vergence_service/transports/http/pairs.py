@@ -150,9 +150,9 @@ def pair_routes(engine: DepthEngine, places: Places, *, limits: UploadLimits) ->
             output=OutputFormat(confidence=query.output is PairOutput.CONFIDENCE),
             cold_iterations=query.iterations,
         )
-        stream = await engine.open_offline(config)
         frame = StereoFrame(1, 0, left, right)
-        disparity, _ = await engine.step_offline(stream, lambda: frame)
+        async with engine.offline(config) as stream:
+            disparity, _ = await engine.step_offline(stream, lambda: frame)
         return await background.run(_answer, disparity, query)
 
     return router

@@ -46,9 +46,11 @@ def stream_routes(
 ) -> APIRouter:
     """Make the routes. A body that comes too slowly is refused."""
 
-    async def body(request: Request, limit: int) -> memoryview:
+    async def body(
+        request: Request, limit: int, *, received: Callable[[int], None] = _uncounted
+    ) -> memoryview:
         chunks = body_of(request, patience_s=patience_s, min_bytes_per_s=min_bytes_per_s)
-        return await _collected(chunks, limit)
+        return await _collected(chunks, limit, received)
 
     def method(
         question: type[Any], answer: Callable[[Any], Coroutine[Any, Any, Message]]
@@ -99,8 +101,10 @@ def stream_routes(
             raise UnknownStream("no open call has this id; open or resume the stream")
         call = open_calls[call_id]
         try:
-            message = await body(request, calls.limits.max_frame_bytes + _BESIDE_IMAGES)
-            await call.put(codec.read_request(message))
+            with calls.memory.hold_frame(0) as memory:  # many may send at once to one call
+                limit = calls.limits.max_frame_bytes + _BESIDE_IMAGES
+                message = await body(request, limit, received=memory.grow)
+                await call.put(codec.read_request(message))
         except DepthError as error:
             call.end(error)  # the client would wait for an answer to this message for ever
             raise
@@ -207,8 +211,17 @@ class _HttpCall:
         await self._outgoing.put(pack_record(RecordKind.MESSAGE, response.SerializeToString()))
 
 
-async def _collected(chunks: AsyncIterator[bytes], limit: int) -> memoryview:
-    """Collect the body of a request. Raises FrameTooLarge if it has more than ``limit`` bytes."""
+def _uncounted(nbytes: int) -> None:
+    """Count nothing, for small bodies."""
+
+
+async def _collected(
+    chunks: AsyncIterator[bytes], limit: int, received: Callable[[int], None]
+) -> memoryview:
+    """Collect the body of a request, and call ``received`` with the size of each piece.
+
+    Raises FrameTooLarge if it has more than ``limit`` bytes, and what ``received`` raises.
+    """
     body = bytearray()
     async for chunk in chunks:
         body += chunk
@@ -217,4 +230,5 @@ async def _collected(chunks: AsyncIterator[bytes], limit: int) -> memoryview:
                 f"expected a message of at most {limit} bytes; the server's setting "
                 "limits.max_frame_mib allows more"
             )
+        received(len(chunk))
     return memoryview(body)

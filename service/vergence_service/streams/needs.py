@@ -1,0 +1,61 @@
+"""What a stream needs, by the size of its images: checked before anything is made for it."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from vergence_proto.errors import BadCalibration, FrameTooLarge
+from vergence_proto.types import StereoRig
+from vergence_service.inference.model import StereoModel, state_bytes
+from vergence_service.memory import StreamMemory
+from vergence_service.streams.search_window import SearchReach
+
+# Smaller images have nothing to match. The network would still see them as wide as its search.
+_LEAST_SIDE = 16
+# Two decoded images in RGB, disparity and sigma in float32, and both encoded.
+_WORK_BYTES_A_PIXEL = 2 * 3 + 2 * 4 + 2 * 2
+# For each camera, positions as two int16 and one uint16; and what the left one sees.
+_MAP_BYTES_A_PIXEL = 2 * 6 + 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImageSizes:
+    """The sizes of images that are served."""
+
+    max_pixels: int
+    max_side: int  # for the memory of a step also grows with the width
+
+    def check(self, rig: StereoRig) -> None:
+        """Raise FrameTooLarge or BadCalibration if the images of a rig have another size."""
+        width, height = rig.left.width, rig.left.height
+        if width * height > self.max_pixels or max(width, height) > self.max_side:
+            raise FrameTooLarge(
+                f"expected at most {self.max_pixels} pixels per image and {self.max_side} per "
+                f"side, got {width}x{height}; send smaller images, or start the server with a "
+                "larger limits.max_pixels or limits.max_side_px"
+            )
+        if min(width, height) < _LEAST_SIDE:
+            raise BadCalibration(
+                f"expected images of at least {_LEAST_SIDE}x{_LEAST_SIDE} pixels, got "
+                f"{width}x{height}"
+            )
+
+
+def stream_memory(
+    rig: StereoRig,
+    model: StereoModel,
+    reach: SearchReach,
+    *,
+    warm_iterations: int,
+    cold_iterations: int,
+) -> StreamMemory:
+    """Return the memory that a stream of this rig needs."""
+    width, height = rig.left.width, rig.left.height
+    reduction = reach.reduction(width)
+    rows, columns = -(-height // reduction), -(-width // reduction)
+    steps: Iterable[tuple[int, bool]] = ((warm_iterations, False), (cold_iterations, True))
+    return StreamMemory(
+        state=state_bytes(model.card, rows, columns),
+        work=_WORK_BYTES_A_PIXEL * width * height,
+        maps=0 if rig.as_rectified() else _MAP_BYTES_A_PIXEL * width * height,
+        step=max(model.step_bytes(rows, columns, count, cold=cold) for count, cold in steps),
+    )
