@@ -1,6 +1,7 @@
 """A client that is silent or slow costs little: each of its waits has a limit."""
 
 import asyncio
+import os
 import resource
 import socket
 import subprocess
@@ -107,14 +108,31 @@ async def test_a_client_that_does_not_read_is_disconnected() -> None:
         own_connection(server) as stub,
     ):
         slow = await opened_large(stub, "slow")
+        descriptors = len(os.listdir("/dev/fd"))
         for frame_id in (1, 2):
             await slow.send(frame_message(make_frame(frame_id, rig=LARGE)))
         await eventually(slow.call.done)
+        # Both ends of the connection are in this process.
+        await eventually(lambda: len(os.listdir("/dev/fd")) <= descriptors - 2)
         assert await slow.call.code() is grpc.StatusCode.UNAVAILABLE
         assert server.engine.streams.get("slow").attachment is None
         # It may come back and resume, as after any lost connection.
         async with raw_stream(server, "other") as other:
             await other.ask(frame_message(make_frame(1)))
+
+
+async def test_an_expired_client_that_sent_beyond_its_credit_is_disconnected() -> None:
+    clock, model = ManualClock(), RecallModel()
+    async with running_server(model, clock=clock) as server, own_connection(server) as stub:
+        call = RawCall(stub.StreamDepth())
+        await call.ask(open_message("mine"))
+        for frame_id in range(1, 6):  # nobody reads the answers
+            await call.send(frame_message(make_frame(frame_id)))
+        await eventually(lambda: server.engine.streams.get("mine").frames_stepped == 5)
+        clock.advance(60)
+        server.engine.streams.sweep()
+        await eventually(call.call.done)
+        assert await call.call.code() is grpc.StatusCode.UNAVAILABLE
 
 
 async def test_other_calls_of_a_connection_survive_the_one_that_does_not_read() -> None:

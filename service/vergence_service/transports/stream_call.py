@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from vergence_proto import codec
-from vergence_proto.errors import DepthError, StreamExists, UnknownStream
+from vergence_proto.errors import DepthError, StreamExists, StreamExpired, UnknownStream
 from vergence_proto.types import Delivery
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.streams.engine import DepthEngine
@@ -69,7 +69,8 @@ class DepthCall:
         self._pings = False  # the client has pinged, so its silence says that it is lost
         self._owed = 0  # frames that have no answer yet
         self._heard_s = clock()  # time of the last message, or of the answer that it waited for
-        self._lost: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        self._overran = False  # the client has sent more frames than its credit allows
+        self._lost: asyncio.Future[ClientLost] = asyncio.get_running_loop().create_future()
         self._detached = asyncio.Event()
 
     @property
@@ -81,8 +82,11 @@ class DepthCall:
         return self._clock() - self._heard_s if self._pings and not self.busy else 0.0
 
     def lose(self, why: str) -> None:
+        self._lose(ClientLost(why, reads=True))
+
+    def _lose(self, lost: ClientLost) -> None:
         if not self._lost.done():
-            self._lost.set_result(why)
+            self._lost.set_result(lost)
 
     async def ended(self) -> None:
         await self._detached.wait()
@@ -97,6 +101,10 @@ class DepthCall:
 
     def end(self, error: DepthError) -> None:
         """Stop reading and stepping at once, send what is ready, and end with the error."""
+        if isinstance(error, StreamExpired) and self._overran:
+            # A client that keeps to its credit reads its answers. This one may not, and an error
+            # would wait behind them.
+            self._lose(ClientLost(str(error), reads=False))
         self.finish(error)
         if self._stepper is not None:
             self._stepper.cancel()
@@ -146,7 +154,7 @@ class DepthCall:
             raise lost
 
     async def _raise_if_lost(self) -> None:
-        raise ClientLost(await self._lost, reads=True)
+        raise await self._lost
 
     async def _write_in_time(self, response: pb.StreamDepthResponse) -> None:
         more_bytes = max(response.ByteSize() - _USUAL_BYTES, 0)
@@ -226,6 +234,7 @@ class DepthCall:
         self, stream: Stream, mailbox: Mailbox, frame: codec.ReceivedFrame, arrived_s: float
     ) -> None:
         self._owed += 1
+        self._overran = self._overran or self._owed > self._limits.credit
         rig = stream.rectifier.rig
         try:
             codec.check_frame(

@@ -7,7 +7,9 @@ Python has no method that ends a call without a status.
 import asyncio
 import os
 import socket
+import stat
 import threading
+from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 from urllib.parse import unquote
@@ -40,24 +42,34 @@ def _close_connection(peer: str) -> bool:
     """Close the TCP connection to ``peer``, as gRPC states it. Return True if it was found."""
     _, _, address = unquote(peer).partition(":")
     host, _, port = address.rpartition(":")
-    for descriptor in _descriptors():
-        with suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as connection:
-            name = connection.getpeername()
-            if (
-                isinstance(name, tuple)
-                and str(name[1]) == port
-                and name[0].removeprefix("::ffff:") == host.strip("[]")
-            ):
+    for descriptor in _sockets():
+        # A copy of the descriptor. A name of AF_INET6 has room for one of IPv4 too.
+        with (
+            suppress(OSError),  # it has been closed
+            socket.fromfd(descriptor, socket.AF_INET6, socket.SOCK_STREAM) as connection,
+        ):
+            if _is_peer(connection.getpeername(), host.strip("[]"), port):
                 connection.shutdown(socket.SHUT_RDWR)
                 return True
     return False
 
 
-def _descriptors() -> list[int]:
-    try:
-        return [int(name) for name in os.listdir("/dev/fd")]  # Linux and macOS
-    except OSError:
-        return []
+def _is_peer(name: Any, host: str, port: str) -> bool:
+    """Tell whether a socket's name is this address. IPv4 may be written as IPv6."""
+    return (
+        isinstance(name, tuple)
+        and str(name[1]) == port
+        and str(name[0]).removeprefix("::ffff:") == host
+    )
+
+
+def _sockets() -> Iterator[int]:
+    """Yield the descriptors of all sockets of this process, where the system lists them."""
+    with suppress(OSError):
+        for name in os.listdir("/dev/fd"):  # Linux and macOS
+            with suppress(OSError):
+                if stat.S_ISSOCK(os.fstat(int(name)).st_mode):
+                    yield int(name)
 
 
 def _cancel(context: Context) -> None:
