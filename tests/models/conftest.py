@@ -1,9 +1,13 @@
-"""Fixtures of the generator's tests."""
+"""Fixtures of the tests of the generator and of the exporter."""
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterator
+
 import pytest
 import torch
+from torch._dynamo import config as torch_config
 
 from tests.support.tiny_scenes import SMALL
 from vergence_models.data.clips import StereoClips
@@ -13,6 +17,16 @@ from vergence_models.data.generator import ClipGenerator
 @pytest.fixture(scope="module", autouse=True)
 def one_thread() -> None:
     torch.set_num_threads(1)
+
+
+@pytest.fixture
+def quick_export(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The exporter without what only costs time: the graphs are the same."""
+    # Under pytest's capture the tracer would format every symbolic shape it meets: minutes of it.
+    monkeypatch.setattr(logging.getLogger("torch.__trace"), "propagate", False)
+    # With symbolic sizes, a cache of operators costs more than it saves: a fifth of the time.
+    with torch_config.patch(fake_tensor_cache_enabled=False):
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import logging
 from pathlib import Path
 
 import numpy as np
@@ -63,11 +62,8 @@ def test_an_untrained_network_already_matches() -> None:
     assert (error > 3).float().mean() < 0.1
 
 
-def test_the_graph_equals_pytorch_frame_by_frame(
-    network: LiteNetwork, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # Under pytest's capture the tracer would format every symbolic shape it meets: minutes of it.
-    monkeypatch.setattr(logging.getLogger("torch.__trace"), "propagate", False)
+@pytest.mark.usefixtures("quick_export")
+def test_the_graph_equals_pytorch_frame_by_frame(network: LiteNetwork, tmp_path: Path) -> None:
     run = Run("lite", network.config, network.state_dict(), story={}, measured={})
     export_run(
         run, Config("lite", network.config, iterations=(1, 2), iterations_at_2x={2: 1}), tmp_path

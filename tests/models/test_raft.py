@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 
 import numpy as np
@@ -53,13 +52,7 @@ def test_the_images_reach_the_answer() -> None:
     assert (one - other).abs().mean() > 0.1
 
 
-@pytest.fixture
-def quiet(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Under pytest's capture the tracer would format every symbolic shape it meets: minutes of it.
-    monkeypatch.setattr(logging.getLogger("torch.__trace"), "propagate", False)
-
-
-@pytest.mark.usefixtures("quiet")
+@pytest.mark.usefixtures("quick_export")
 def test_exported_graphs_equal_pytorch_and_share_their_weights(tmp_path: Path) -> None:
     network = tiny_network()
     run = Run("full", network.config, network.state_dict(), story={}, measured={})
@@ -83,7 +76,7 @@ def test_exported_graphs_equal_pytorch_and_share_their_weights(tmp_path: Path) -
         load_model_card(tmp_path, "full")
 
 
-@pytest.mark.usefixtures("quiet")
+@pytest.mark.usefixtures("quick_export")
 def test_the_exported_beginning_without_a_warp_equals_pytorch(tmp_path: Path) -> None:
     """Of `fast`. What follows it is the code of `full`, to the last operation."""
     network = folded(tiny_network(warp=False))

@@ -58,6 +58,12 @@ def networks() -> list[StudiedNetwork]:
 
 
 @pytest.fixture(scope="module")
+def with_run() -> list[StudiedNetwork]:
+    """The graphs, and the run that they were exported from."""
+    return gather_networks([WEIGHTS], [RUN], threads=1)
+
+
+@pytest.fixture(scope="module")
 def network(networks: list[StudiedNetwork]) -> SteppedNetwork:
     return networks[0].network
 
@@ -180,9 +186,9 @@ def test_the_same_seed_gives_the_same_tables(
 
 
 def test_a_run_adds_only_the_counts_that_no_graph_has(
-    network: SteppedNetwork, wall: Footage
+    with_run: list[StudiedNetwork], network: SteppedNetwork, wall: Footage
 ) -> None:
-    graphs, run = gather_networks([WEIGHTS], [RUN], threads=1)
+    graphs, run = with_run
     assert not set(graphs.warm) & set(run.warm)
     assert not set(graphs.single_frame) & set(run.single_frame)
     assert run.training.runtime == "PyTorch"
@@ -266,9 +272,8 @@ def test_every_study_has_a_name_of_its_own() -> None:
     assert len({study.__doc__ for study in STUDIES.values()}) == len(STUDIES)
 
 
-def test_learning_curves_are_those_of_the_log(cache: Path, tmp_path: Path) -> None:
-    networks = gather_networks([WEIGHTS], [RUN], threads=1)
-    table = learning_curves(new_bench(networks, cache))
+def test_learning_curves_are_those_of_the_log(with_run: list[StudiedNetwork], cache: Path) -> None:
+    table = learning_curves(new_bench(with_run, cache))
     assert table.rows[-1].values["warm_epe"] == read_run(RUN).measured["warm_epe"]
     for curve in table.curves:
         assert curve.x == sorted(curve.x)

@@ -122,7 +122,7 @@ async def test_an_address_of_another_machine_is_told_apart_from_a_port_that_is_t
 
 @contextmanager
 def served(*arguments: str) -> Iterator[subprocess.Popen[str]]:
-    """A server process with the packaged weights."""
+    """A server process."""
     process = subprocess.Popen(
         [sys.executable, "-m", "vergence_service", *arguments],
         stdin=subprocess.PIPE,
@@ -137,7 +137,11 @@ def served(*arguments: str) -> Iterator[subprocess.Popen[str]]:
         process.communicate()
 
 
-SMALL = ("--grpc-port", "0", "--http-port", "0", "--threads", "1")
+# A small model, which is loaded at once.
+SMALL = (
+    *("--grpc-port", "0", "--http-port", "0", "--threads", "1"),
+    *("--weights", str(WEIGHTS), "--model", "whole"),
+)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=lambda number: number.name)
