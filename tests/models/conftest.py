@@ -7,7 +7,6 @@ from collections.abc import Iterator
 
 import pytest
 import torch
-from torch._dynamo import config as torch_config
 
 from tests.support.tiny_scenes import SMALL
 from vergence_models.data.clips import StereoClips
@@ -24,8 +23,10 @@ def quick_export(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The exporter without what only costs time: the graphs are the same."""
     # Under pytest's capture the tracer would format every symbolic shape it meets: minutes of it.
     monkeypatch.setattr(logging.getLogger("torch.__trace"), "propagate", False)
+    from torch._dynamo import config  # takes seconds to import, and most tests do not need it
+
     # With symbolic sizes, a cache of operators costs more than it saves: a fifth of the time.
-    with torch_config.patch(fake_tensor_cache_enabled=False):
+    with config.patch(fake_tensor_cache_enabled=False):
         yield
 
 
