@@ -27,6 +27,8 @@ _FREE_ENDPOINT = '["tcp/127.0.0.1:0"]'
 SAMPLE = Path("client/vergence/sample/room")
 SAMPLE_FRAMES = 6
 
+_EVERYTHING = "vergence serve --zenoh"
+
 Ports = dict[str, str]
 
 
@@ -49,14 +51,20 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def ports(environment: dict[str, str]) -> Iterator[Ports]:
-    """A server that speaks everything; its ports by transport."""
-    command = [sys.executable, "-m", "vergence_service", *_ON_FREE_PORTS, "--zenoh"]
+    """A server that speaks everything, started as the pages say; its ports by transport."""
+    command = ["bash", "-c", f"exec {_EVERYTHING} {' '.join(_ON_FREE_PORTS)}"]
     with Popen(command, env=environment, stdout=PIPE, text=True) as server:
         assert server.stdout is not None
         listening = next(filter(None, map(_LISTENING.search, server.stdout)), None)
         assert listening is not None, "the server did not start"
         yield listening.groupdict()
         server.terminate()
+
+
+@pytest.fixture(scope="module")
+def have_served(ports: Ports) -> set[str]:
+    """The commands that have started a server already: each is started once for all pages."""
+    return {_EVERYTHING}
 
 
 @pytest.fixture
@@ -108,7 +116,7 @@ def test_every_python_block_runs(
 
 @pytest.mark.parametrize("page", pages_with("sh"), ids=str)
 def test_every_shell_line_runs(
-    page: Path, checkout: Path, environment: dict[str, str], ports: Ports
+    page: Path, checkout: Path, environment: dict[str, str], ports: Ports, have_served: set[str]
 ) -> None:
     for block in blocks_of(page, "sh"):
         for command in commands_of(block) if block.reason is None else []:
@@ -117,7 +125,10 @@ def test_every_shell_line_runs(
             elif (
                 re.match(r"(\w+=\S+ )*vergence serve", command) and "--print-config" not in command
             ):
-                check_it_serves(command.rstrip("& "), checkout, environment)
+                serving = command.rstrip("& ")
+                if serving not in have_served:
+                    check_it_serves(serving, checkout, environment)
+                    have_served.add(serving)
             else:
                 run(["bash", "-c", at_these(ports, command)], checkout, environment)
 
