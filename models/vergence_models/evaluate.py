@@ -14,8 +14,11 @@ import argparse
 import dataclasses
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
+
+from rich.progress import Progress
 
 from vergence_models.data.pool import ClipPool
 from vergence_models.evaluation.evidence import SURE, Doubt, doubts_of
@@ -33,10 +36,12 @@ from vergence_models.evaluation.number_format import cell, decimals
 from vergence_models.evaluation.stepping import (
     Footage,
     OnnxNetwork,
+    Prediction,
     SteppedNetwork,
     footage_from_clip,
     footage_from_source,
 )
+from vergence_models.progress import no_progress, progress_bar
 from vergence_models.training.validation import filmed
 from vergence_proto.datasets import DatasetError, find_sources, open_source
 from vergence_proto.model_io import ManifestError
@@ -85,16 +90,49 @@ def gather(sources: list[str], pool: list[Path], clips: int) -> Iterator[tuple[s
             yield f"pool {folder.name}", footage
 
 
-def evaluate(methods: list[Method], footages: Iterator[tuple[str, Footage]]) -> Results:
-    """Group -> method -> its figures."""
+def evaluate(
+    methods: list[Method],
+    footages: Iterator[tuple[str, Footage]],
+    *,
+    progress: Progress | None = None,
+    count: int | None = None,
+) -> Results:
+    """Group -> method -> its figures; ``count`` is the number of footages, for the progress bar."""
+    progress = progress or no_progress()
     results: Results = {}
+    whole = progress.add_task("sequences", total=count, note="")
     for group, footage in footages:
         accumulators = results.setdefault(
             group, {method.label: MetricAccumulator() for method in methods}
         )
+        frames = len(footage.views)
+        bar = progress.add_task(footage.name, total=frames * len(methods), note="")
         for method in methods:
-            accumulators[method.label].add(footage, method.predict(footage))
+            progress.update(bar, note=method.label)
+            accumulators[method.label].add(
+                footage, _counted(method.predict(footage), partial(progress.advance, bar))
+            )
+        progress.remove_task(bar)
+        progress.advance(whole)
+        progress.console.print(_in_short(footage, methods, accumulators), soft_wrap=True)
     return results
+
+
+def _counted(
+    predictions: Iterator[Prediction], advance: Callable[[], None]
+) -> Iterator[Prediction]:
+    for prediction in predictions:
+        advance()  # first: nobody asks for more after the last one
+        yield prediction
+
+
+def _in_short(
+    footage: Footage, methods: list[Method], accumulators: dict[str, MetricAccumulator]
+) -> str:
+    """The errors so far of the group that the footage belongs to."""
+    found = {each.label: accumulators[each.label].summary().get("epe") for each in methods}
+    errors = [f"{label} {epe:.2f}" for label, epe in found.items() if epe is not None]
+    return f"{footage.name}, EPE in px: {'; '.join(errors) or 'no truth'}"
 
 
 COLUMNS = {
@@ -209,12 +247,17 @@ def main(arguments: list[str] | None = None) -> None:
         # Before the graphs are loaded, which takes seconds.
         sources = [source for spec in given.data for source in find_sources(spec)]
         network = OnnxNetwork(given.weights, given.model, threads=given.threads)
-        results = evaluate(
-            methods_for(network, thorough=given.thorough),
-            gather(sources, given.pool, given.clips),
-        )
+        with progress_bar() as progress:
+            results = evaluate(
+                methods_for(network, thorough=given.thorough),
+                gather(sources, given.pool, given.clips),
+                progress=progress,
+                count=len(sources) + sum(min(given.clips, len(ClipPool(p))) for p in given.pool),
+            )
     except (ManifestError, DatasetError, FileNotFoundError) as error:
         sys.exit(f"vergence_models.evaluate: {error}")
+    except KeyboardInterrupt:
+        sys.exit(130)
     tables, values = markdown(results), as_json(results)
     if given.no_evidence:
         doubts = doubts_of(network)

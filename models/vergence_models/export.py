@@ -12,7 +12,7 @@ import hashlib
 import json
 import logging
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import cast
@@ -22,6 +22,7 @@ import onnx
 import torch
 from numpy.typing import NDArray
 from onnx import ModelProto
+from rich.progress import Progress
 
 from vergence_models.config import Config, ConfigError, StepKind, load_config
 from vergence_models.data.pool import ClipPool
@@ -40,6 +41,7 @@ from vergence_models.onnx_export.stitch import (
     stitched,
     write_with_shared_weights,
 )
+from vergence_models.progress import no_progress, progress_bar, silent
 from vergence_models.training.runs import Run, RunError, read_run, trained_network
 from vergence_proto.model_io import MANIFEST_FORMAT, MANIFEST_NAME
 
@@ -108,15 +110,24 @@ def check_parity(
     return worst
 
 
-def export_run(run: Run, config: Config, out: Path, *, int8_clips: ClipPool | None = None) -> None:
+def export_run(
+    run: Run,
+    config: Config,
+    out: Path,
+    *,
+    int8_clips: ClipPool | None = None,
+    progress: Progress | None = None,
+) -> None:
     """Write every graph of one tier and its entry of the manifest; other entries stay.
 
     With ``int8_clips`` the graphs are int8 ones, made of those that were checked.
     """
     network = trained_network(run)
-    parts = exported_parts(network)
+    progress = progress or no_progress()
     kinds = [StepKind(count) for count in config.iterations]
     kinds += [StepKind(count, at_2x) for count, at_2x in config.iterations_at_2x.items()]
+    bar = progress.add_task("export", total=None, note="")
+    parts = exported_parts(network, lambda note: progress.update(bar, advance=1, note=note))
     models = {kind: stitched(parts, kind) for kind in kinds}
     entry: dict[str, object] = {
         "stride": run.network.stride,
@@ -132,6 +143,7 @@ def export_run(run: Run, config: Config, out: Path, *, int8_clips: ClipPool | No
         write_model(Path(folder), config.name, models, parts, entry)
         graphs = OnnxNetwork(Path(folder), config.name)
         for kind in models:
+            progress.update(bar, advance=1, note=f"checking {config.name}_{kind} against PyTorch")
             worst = check_parity(network, graphs, kind)
             log.info("%s_%s: within %.1e px of PyTorch", config.name, kind, worst)
     if int8_clips is not None:
@@ -140,6 +152,7 @@ def export_run(run: Run, config: Config, out: Path, *, int8_clips: ClipPool | No
             network.state_tensors,
             int8_clips,
             max_disparity_px=run.network.max_disparity_px,
+            on_step=lambda note: progress.update(bar, advance=1, note=note),
         )
         log.info("int8: %s", entry["int8"])
     write_model(out, config.name, models, parts, entry)
@@ -180,8 +193,13 @@ def write_model(
     write_entry(out / MANIFEST_NAME, name, complete)
 
 
-def exported_parts(network: AnyNetwork) -> StepParts[ModelProto]:
-    """The graphs that :func:`stitched` takes, batch norms folded."""
+def exported_parts(
+    network: AnyNetwork, on_step: Callable[[str], None] = silent
+) -> StepParts[ModelProto]:
+    """The graphs that :func:`stitched` takes, batch norms folded.
+
+    ``on_step`` is told of each part before it is traced.
+    """
     match folded(network):
         case LiteNetwork() as lite:
             parts = lite_parts_of(lite)
@@ -191,6 +209,7 @@ def exported_parts(network: AnyNetwork) -> StepParts[ModelProto]:
             raise ConfigError(f"no parts of a {type(other).__name__}")
 
     def exported(part: GraphPart) -> ModelProto:
+        on_step(f"tracing {type(part.module).__name__}")
         with TemporaryDirectory() as folder:
             path = Path(folder) / "part.onnx"
             export_part(part, path)
@@ -226,15 +245,25 @@ def main(arguments: list[str] | None = None) -> None:
         "--int8", type=Path, metavar="POOL", help="make int8 graphs, their ranges from its clips"
     )
     given = parser.parse_args(arguments)
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
     for chatty in ("torch.onnx", "onnxscript", "onnx_ir"):
         logging.getLogger(chatty).setLevel(logging.ERROR)
     try:
         run = read_run(given.run)
         int8_clips = None if given.int8 is None else ClipPool(given.int8)
-        export_run(run, load_config(run.config_name), given.out, int8_clips=int8_clips)
+        with progress_bar(counted=False) as progress:
+            # After the bar has begun: lines of the log are then written above it.
+            logging.basicConfig(level=logging.INFO, format="%(message)s")
+            export_run(
+                run,
+                load_config(run.config_name),
+                given.out,
+                int8_clips=int8_clips,
+                progress=progress,
+            )
     except (ConfigError, FileNotFoundError, RunError) as error:
         sys.exit(f"vergence_models.export: {error}")
+    except KeyboardInterrupt:
+        sys.exit(130)
 
 
 if __name__ == "__main__":

@@ -25,9 +25,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from rich.progress import Progress
 
 from vergence_models.config import CONFIGS, load_config
 from vergence_models.data.pool import ClipPool
+from vergence_models.progress import progress_bar
 from vergence_models.training.batches import batches
 from vergence_models.training.runs import CHECKPOINT_NAME, LOG_NAME, RunError
 from vergence_models.training.trainer import Trainer, learning_rate
@@ -36,13 +38,14 @@ from vergence_models.training.validation import save_picture, validate
 log = logging.getLogger("vergence_models.train")
 
 
-def train(trainer: Trainer, arguments: argparse.Namespace) -> None:
+def train(trainer: Trainer, arguments: argparse.Namespace, progress: Progress) -> None:
     """The loop: step, log, save, validate, until a signal arrives or the minutes are over."""
     stop = False
 
     def on_signal(number: int, frame: FrameType | None) -> None:
         nonlocal stop
         stop = True
+        signal.signal(number, signal.SIG_DFL)  # a second signal ends the run at once
 
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, on_signal)
@@ -60,9 +63,17 @@ def train(trainer: Trainer, arguments: argparse.Namespace) -> None:
         first_step=trainer.progress.steps,
         workers=arguments.workers,
     )
+    bar = progress.add_task(f"training {trainer.config.name}", total=None, note="the first step")
+    if math.isfinite(arguments.minutes):
+        progress.update(bar, total=round(60 * arguments.minutes))
+    else:
+        log.info("training until Ctrl-C; --minutes ends it by itself")
     while not stop and elapsed_minutes() < arguments.minutes:
         recent.append(trainer.step(next(training_batches)))
         now = time.monotonic()
+        progress.update(
+            bar, completed=round(now - started), note=note_of(trainer, recent[-1], now - last)
+        )
         trainer.progress.minutes += (now - last) / 60
         last = now
         if len(recent) == arguments.log_every:
@@ -72,6 +83,7 @@ def train(trainer: Trainer, arguments: argparse.Namespace) -> None:
             saved = now
             trainer.save(out)
         if held_out is not None and now - validated > 60 * arguments.val_minutes:
+            progress.update(bar, note="validating")
             network = trainer.averaged_network()
             trainer.measured = validate(network, held_out, trainer.device)
             save_picture(network, held_out, out / "sample.png", trainer.device)
@@ -81,9 +93,19 @@ def train(trainer: Trainer, arguments: argparse.Namespace) -> None:
     training_batches.close()
     trainer.save(out)  # before the slow validation: a stopped run may be killed during it
     if held_out is not None and trainer.progress.steps:
+        progress.update(bar, note="saved; validating (a second Ctrl-C skips it)")
         trainer.measured = validate(trainer.averaged_network(), held_out, trainer.device)
         write_line(out, {"step": trainer.progress.steps, "validation": trainer.measured})
     trainer.save(out)
+    log.info("saved %s at step %d; --resume continues it", out, trainer.progress.steps)
+
+
+def note_of(trainer: Trainer, figures: dict[str, float], step_s: float) -> str:
+    """What the bar says of one step."""
+    return (
+        f"step {trainer.progress.steps}, {1 / max(step_s, 1e-9):.2g} steps/s, "
+        f"loss {figures['loss']:.2f}, error {figures['later']:.2f} px"
+    )
 
 
 def report(out: Path, trainer: Trainer, recent: list[dict[str, float]]) -> None:
@@ -132,7 +154,15 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 
 def main(arguments: list[str] | None = None) -> None:
     given = parse(arguments)
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    words = arguments if arguments is not None else sys.argv[1:]
+    with progress_bar(counted=False) as progress:
+        # After the bar has begun: lines of the log are then written above it.
+        logging.basicConfig(level=logging.INFO, format="%(message)s")
+        run(given, words, progress)
+
+
+def run(given: argparse.Namespace, words: list[str], progress: Progress) -> None:
+    """Make or load the trainer that the arguments ask for, and train it."""
     config = load_config(given.config)
     changed = {
         entry.name: getattr(given, entry.name)
@@ -155,9 +185,8 @@ def main(arguments: list[str] | None = None) -> None:
             sys.exit(f"vergence_models.train: {error}")
         log.info("untrained: %s", ", ".join(missing) or "nothing")
     given.out.mkdir(parents=True, exist_ok=True)
-    words = arguments if arguments is not None else sys.argv[1:]
     trainer.commands.append(shlex.join(["python", "-m", "vergence_models.train", *words]))
-    train(trainer, given)
+    train(trainer, given, progress)
 
 
 if __name__ == "__main__":

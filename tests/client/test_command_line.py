@@ -44,6 +44,16 @@ def test_the_short_flag_of_help_is_the_long_one(command: str) -> None:
     assert "Usage:" in short
 
 
+def test_no_program_of_the_tree_is_without_the_short_flag() -> None:
+    # argparse always knows it.
+    sources = [
+        path
+        for folder in ("client", "models", "proto", "service", "tests")
+        for path in (ROOT / folder).rglob("*.py")
+    ]
+    assert [path for path in sources if "typer" + ".run(" in path.read_text("utf-8")] == []
+
+
 @pytest.mark.parametrize(
     ("words", "expected"),
     [("vergence ser", "serve"), ("vergence serve --grpc", "--grpc-port")],

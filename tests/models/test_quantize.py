@@ -222,9 +222,18 @@ def test_a_scale_covers_its_range_and_zero_is_exact(low: float, high: float) -> 
 def test_graphs_are_made_and_the_loss_is_told(pool: ClipPool) -> None:
     wall = wall_model()
     before = wall.SerializeToString()
+    steps: list[str] = []
     models, told = make_int8(
-        {StepKind(1): wall, StepKind(2): wall}, STATES, pool, max_disparity_px=192
+        {StepKind(1): wall, StepKind(2): wall},
+        STATES,
+        pool,
+        max_disparity_px=192,
+        on_step=steps.append,
     )
+    assert [step.partition(": the ")[2].split()[0] for step in steps] == [
+        *("ranges", "rounding", "loss"),
+        *("ranges", "rounding"),
+    ]
     story = cast("dict[str, Any]", told)
     assert story["convolutions"] == 3
     assert story["measured_clips"] == 2

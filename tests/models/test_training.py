@@ -66,12 +66,18 @@ def test_a_resumed_run_equals_one_that_was_never_stopped(pool: Path, tmp_path: P
 
 
 def test_the_command_trains_saves_and_goes_on(
-    pool: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    pool: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
+    caplog.set_level("INFO", "vergence_models.train")
     monkeypatch.setitem(configs.CONFIGS, "lite", SMALL)
     out = tmp_path / "run"
     command = ["--pool", str(pool), "--out", str(out), "--batch", "1", "--frames", "2"]
     main([*command, "--val", str(pool), "--minutes", "0.01", "--log-every", "1"])
+    assert f"saved {out} at step " in caplog.text
+    assert "--resume continues it" in caplog.text
     first = read_run(out)
     assert first.story["steps"] >= 1
     assert first.measured["warm_epe"] > 0

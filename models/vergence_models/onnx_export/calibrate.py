@@ -6,7 +6,7 @@ so the ranges are those of recurrent use.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 import onnxruntime
@@ -20,6 +20,7 @@ from vergence_models.onnx_export.pair_sums import overflowing
 from vergence_models.onnx_export.quantization_plan import plan_quantization
 from vergence_models.onnx_export.quantize import ByteScale, copy_of, quantized, with_weights_apart
 from vergence_models.onnx_export.rounding import inputs_of
+from vergence_models.progress import silent
 from vergence_models.training.camera_motion import uvd_transforms
 from vergence_models.training.validation import filmed
 from vergence_proto.model_io import DISPARITY, LEFT, RIGHT, UVD_CURR_FROM_PREV, StateTensor
@@ -45,8 +46,11 @@ def make_int8(
     pool: ClipPool,
     *,
     max_disparity_px: float,
+    on_step: Callable[[str], None] = silent,
 ) -> tuple[dict[StepKind, ModelProto], dict[str, object]]:
     """Int8 graphs of float graphs, and their entry of the manifest.
+
+    ``on_step`` is told of each part of the work before it begins.
 
     Raises QuantizationError if the smallest loses more than :data:`MAX_LOSS`, or if a product in
     any of them may overflow 16 bits.
@@ -58,15 +62,18 @@ def make_int8(
         model = with_weights_apart(whole)
         what = plan_quantization(model)
         cold = kind.at_2x > 0
+        on_step(f"int8, {kind}: the ranges of activations")
         seen = steps(model, states, clips, what.measured, forget=cold)
         scales = scales_of(seen, what.measured)
         convolutions = [each for each in model.graph.node if each.output[0] in what.convolutions]
         names = sorted({each.input[0] for each in convolutions})
+        on_step(f"int8, {kind}: the rounding of weights")
         seen = steps(model, states, clips, names, forget=cold)
         int8 = quantized(model, what, scales, inputs_of(seen, convolutions, model))
         if wrong := overflowing(int8):
             raise QuantizationError(f"{kind}: pair sums may overflow in {', '.join(wrong)}")
         if not made:
+            on_step(f"int8, {kind}: the loss")
             before, after = (epe_px(each, states, pool, max_disparity_px) for each in (model, int8))
             if not after < MAX_LOSS * before:
                 raise QuantizationError(

@@ -130,4 +130,8 @@ def _table() -> Table:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    program = typer.Typer(
+        add_completion=False, context_settings={"help_option_names": ["-h", "--help"]}
+    )
+    program.command()(main)
+    program()
