@@ -3,6 +3,7 @@
 from vergence.blocking import BlockingClient, BlockingSession, depth
 from vergence.client import DepthClient
 from vergence.errors import NotOpen, WrongDelivery
+from vergence.filters import keep_confident, keep_range, without_speckles
 from vergence.info import ModelInfo, ServerInfo, StreamInfo
 from vergence.reprojection import DepthView, View, reproject
 from vergence.results import DepthResult, Drops, EventKind, SessionEvent
@@ -113,5 +114,8 @@ __all__ = [
     "View",
     "WrongDelivery",
     "depth",
+    "keep_confident",
+    "keep_range",
     "reproject",
+    "without_speckles",
 ]

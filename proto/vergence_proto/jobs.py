@@ -23,14 +23,15 @@ class Output(StrEnum):
     DISPARITY = "disparity"
     DEPTH = "depth"
     CONFIDENCE = "confidence"
+    SIGMA = "sigma"
 
 
 class ResultFormat(StrEnum):
     """The file format of a job's result."""
 
     PNG16 = "png16"
-    """16-bit PNG: disparity times 256, 0 where there is no value (the KITTI convention);
-    confidence as 8-bit PNG."""
+    """16-bit PNG: disparity, depth and sigma times 256, 0 where there is no value (the KITTI
+    convention); confidence as 8-bit PNG."""
     PFM = "pfm"
     """Portable float map, 32-bit floats."""
     NPZ = "npz"

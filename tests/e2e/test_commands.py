@@ -104,7 +104,11 @@ def test_run_writes_every_frame_losslessly(wall: Path, server: str, tmp_path: Pa
     )
     assert done.returncode == 0, done.stderr
     names = [f"{index:04d}.png" for index in range(5)]
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [*names, "sheet.png"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        *names,
+        "rig.json",
+        "sheet.png",
+    ]
     figures = json.loads((tmp_path / "figures.json").read_text())
     assert (figures["frames"], figures["frames_dropped"]) == (5, 0)
     errors_px = []
@@ -121,7 +125,7 @@ def test_run_takes_a_lone_pair_and_starts_a_server_for_it(tmp_path: Path) -> Non
     pair = write_pair(tmp_path / "pair")
     done = vergence("run", f"vergence:{pair}", "--out", tmp_path / "out", "--json", tmp_path / "j")
     assert done.returncode == 0, done.stderr
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["disp.png"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["disp.png", "rig.json"]
     assert json.loads((tmp_path / "j").read_text())["epe_px"] is None  # the pair has no truth
 
 
@@ -131,7 +135,10 @@ def test_run_takes_two_images_and_says_what_is_missing(server: str, tmp_path: Pa
     done = vergence("run", *images, "--server", server, "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     assert "without a calibration there is disparity in pixels" in " ".join(done.stdout.split())
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["disp.png", "sheet.png"]
+    assert sorted(path.name for path in (tmp_path / "out").glob("*.png")) == [
+        "disp.png",
+        "sheet.png",
+    ]
     metres = ("--fx", FX, "--baseline", BASELINE_M, "--no-pictures")
     done = vergence("run", *images, *metres, "--server", server, "--out", tmp_path / "metres")
     assert done.returncode == 0, done.stderr
@@ -182,7 +189,7 @@ def test_run_at_a_rate_accounts_for_every_frame(wall: Path, server: str, tmp_pat
     figures = json.loads((tmp_path / "figures.json").read_text())
     assert figures["frames"] + figures["frames_dropped"] == 5
     assert figures["frames_dropped"] > 0  # five frames in 2.5 ms are more than the credit
-    assert len(list((tmp_path / "out").iterdir())) == figures["frames"]
+    assert len(list((tmp_path / "out").glob("*.png"))) == figures["frames"]
     assert "at the source" in done.stdout
 
 
@@ -216,9 +223,33 @@ def test_a_damaged_frame_in_the_middle_is_named(server: str, tmp_path: Path) -> 
     damaged = film / "frame_0001_right.png"
     damaged.write_bytes(damaged.read_bytes()[:200])
     done = vergence("run", f"vergence:{film}", "--server", server, "--out", tmp_path / "out")
-    assert done.returncode == 2
+    assert done.returncode == 1
+    assert "1 of 3 frames lack a file" in done.stderr
     assert str(damaged) in done.stderr
     assert "Traceback" not in done.stderr
+    names = sorted(path.name for path in (tmp_path / "out").glob("*.png"))
+    assert names == ["0000.png", "0002.png"]
+
+
+def test_run_writes_the_maps_and_values_that_are_asked_for(
+    wall: Path, server: str, tmp_path: Path
+) -> None:
+    wall_m = FX * BASELINE_M / DISPARITY_PX  # errors put a part of the wall beyond it
+    outputs = (f"--output={each}" for each in ("disparity", "depth", "sigma", "confidence"))
+    done = vergence(
+        *("run", f"vergence:{wall}", "--server", server, "--out", tmp_path, "--frames", 2),
+        *outputs,
+        *("--min-confidence", 120, "--max-depth", wall_m, "--speckle", 30, "--format", "npz"),
+        *("--json", tmp_path / "figures.json"),
+    )
+    assert done.returncode == 0, done.stderr
+    with np.load(tmp_path / "0001.npz") as arrays:
+        kept = np.isfinite(arrays["disparity"])
+        assert {*arrays} == {"disparity", "depth", "sigma", "confidence"}
+        assert arrays["confidence"][kept].min() >= 120
+        assert np.nanmax(arrays["depth"]) <= wall_m
+    figures = json.loads((tmp_path / "figures.json").read_text())
+    assert 0 < figures["kept_pct"] < 100
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,6 @@ from tests.support.models import RecallModel
 from tests.support.polling import eventually, turns
 from tests.support.sequences import make_frames, write_sequence
 from tests.support.server import running_server
-from vergence_proto.accuracy import Accuracy
 from vergence_service.inference.model import Step, StepResult, StereoView
 from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
 from vergence_service.inference.snapshots import BadSnapshot, state_from_bytes, state_to_bytes
@@ -23,7 +22,7 @@ from vergence_service.jobs.checkpoints import read_checkpoint, write_checkpoint
 from vergence_service.jobs.job import Job, JobOptions
 from vergence_service.jobs.progress import JobProgress
 from vergence_service.jobs.results import read_frames
-from vergence_service.jobs.run import run_job
+from vergence_service.jobs.run import Finished, run_job
 
 FRAMES = 24
 
@@ -95,7 +94,7 @@ def make_job(folder: Path, *, metrics: bool = False, frames: int = FRAMES) -> Jo
     )
 
 
-async def run(model: RecallModel, folder: Path, job: Job) -> tuple[JobProgress, Accuracy | None]:
+async def run(model: RecallModel, folder: Path, job: Job) -> tuple[JobProgress, Finished]:
     progress = JobProgress()
     async with running_server(model) as server:
         found = await run_job(server.engine, folder, job, progress, checkpoint_s=1e-9)
@@ -116,7 +115,7 @@ async def run_to_the_middle(folder: Path, job: Job) -> None:
 
 
 def maps_in(folder: Path) -> list[NDArray[np.float32]]:
-    return [frame.offset_px for frame in read_frames(folder / "result")]
+    return [frame.offset_px for _, frame in read_frames(folder / "result")]
 
 
 async def test_a_sequence_continues_from_its_checkpoint_to_the_bit(tmp_path: Path) -> None:

@@ -288,6 +288,37 @@ async def test_a_pair_is_answered_at_once() -> None:
     assert confidence.any()
 
 
+async def test_a_pair_comes_with_every_map_in_one_archive() -> None:
+    files = {"left": png(FRAMES[0].left), "right": png(FRAMES[0].right)}
+    rig: dict[str, str | float] = {"fx_px": RIG.fx, "baseline_m": RIG.baseline_m}
+    async with http_server(RecallModel()) as client:
+
+        async def ask(**query: str) -> bytes:
+            answer = await client.post("/v1/pairs", params={**rig, **query}, files=files)
+            assert answer.status_code == 200, answer.text
+            return answer.content
+
+        with np.load(io.BytesIO(await ask(format="npz"))) as arrays:
+            maps = dict(arrays)
+        for name, values in maps.items():
+            alone = np.load(io.BytesIO(await ask(format="npy", output=name)))
+            np.testing.assert_array_equal(alone, values)
+        stored = {
+            (form, name): cv2.imdecode(
+                np.frombuffer(await ask(format=form, output=name), np.uint8), cv2.IMREAD_UNCHANGED
+            )
+            for form, name in (("png16", "sigma"), ("png16", "confidence"), ("png16mm", "depth"))
+        }
+        refused = await client.post("/v1/pairs", params={"format": "png16mm"}, files=files)
+    assert {*maps} == {"disparity", "depth", "confidence", "sigma"}
+    sigma, confidence, depth_mm = stored.values()
+    np.testing.assert_array_equal(sigma, np.rint(np.minimum(maps["sigma"], 255.998) * 256))
+    np.testing.assert_array_equal(confidence, maps["confidence"])
+    expected_mm = np.rint(np.nan_to_num(maps["depth"]) * 1000)
+    np.testing.assert_array_equal(depth_mm, np.where(expected_mm < 65536, expected_mm, 0))
+    assert reason_of(refused) == "BAD_SHAPE"
+
+
 async def test_a_depth_that_a_png_cannot_hold_has_no_value_in_it() -> None:
     files = {"left": png(FRAMES[0].left), "right": png(FRAMES[0].right)}
     query: dict[str, str | float] = {"output": "depth", "fx_px": 4000.0, "baseline_m": 1.0}

@@ -1,10 +1,13 @@
 """Forms, images and uploads that are not what they should be are refused, or fail their job."""
 
 import asyncio
+import io
 import json
+import zipfile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.support.http import ended, http_server, http_to, reason_of, submit
@@ -65,12 +68,54 @@ async def test_forms_are_refused_with_what_they_lack(tmp_path: Path) -> None:
         assert not [*(tmp_path / "incoming").iterdir(), *(tmp_path / "jobs").iterdir()]
 
 
-async def test_an_image_that_cannot_be_read_fails_its_job_and_names_it() -> None:
-    files = {**FILES, "frame_0001_left.png": png(make_frames(1)[0].left[:20])}
+THREE = dict(sequence_files(make_frames(3)))
+
+
+def without(*names: str) -> dict[str, bytes]:
+    return {name: content for name, content in THREE.items() if name not in names}
+
+
+def truth(*shape: int) -> bytes:
+    file = io.BytesIO()
+    np.savez(file, disp=np.ones(shape, np.uint16))
+    return file.getvalue()
+
+
+SMALL = png(make_frames(1)[0].left[:20])
+
+
+@pytest.mark.parametrize(
+    ("files", "unread", "note"),
+    [
+        (without("frame_0001_right.png"), [1], "frame_0001_right.png: not found"),
+        (without("frame_0000_left.png"), [0], "frame_0000_left.png: not found"),
+        ({**THREE, "frame_0002_left.png": SMALL}, [2], "frame_0002_left.png: expected 64x48"),
+        ({**THREE, "frame_0001_gt.npz": truth(3, 3)}, [], "the truth of frame 2 is 3x3"),
+        (without("frame_0001_gt.npz"), [], "1 of 3 frames have no ground truth"),
+    ],
+    ids=["right image", "first image", "another size", "truth of another size", "no truth"],
+)
+async def test_an_image_that_cannot_be_read_costs_its_own_frame(
+    files: dict[str, bytes], unread: list[int], note: str
+) -> None:
+    async with http_server(RecallModel()) as client:
+        job = await submit(client, zip_bytes(files.items()), metrics=True, output="sigma")
+        job = await ended(client, job["id"])
+        answer = await client.get(f"/v1/sequences/{job['id']}/result", params={"format": "npz"})
+    assert job["state"] == "done", job
+    assert job["frames_unread"] == len(unread)
+    assert any(note in each for each in job["notes"]), job["notes"]
+    with zipfile.ZipFile(io.BytesIO(answer.content)) as file:
+        names = [name for name in file.namelist() if name.endswith(".npz")]
+    assert names == [f"{index:04d}.npz" for index in range(3) if index not in unread]
+
+
+async def test_a_sequence_of_which_nothing_can_be_read_fails() -> None:
+    files = {name: SMALL if name.endswith("left.png") else file for name, file in THREE.items()}
     async with http_server(RecallModel()) as client:
         job = await ended(client, (await submit(client, zip_bytes(files.items())))["id"])
     assert (job["state"], job["reason"]) == ("failed", "BAD_SEQUENCE")
-    assert job["message"].startswith("frame_0001_left.png: expected 64x48")
+    assert job["message"].startswith("frame_0000_left.png: expected 64x48")
 
 
 PAIR = {"left": png(make_frames(1)[0].left), "right": png(make_frames(1)[0].right)}

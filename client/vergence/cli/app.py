@@ -3,6 +3,7 @@
 A command imports what it needs when it is called, so that ``--help`` answers at once.
 """
 
+import math
 from collections.abc import Callable, Coroutine
 from importlib import metadata
 from pathlib import Path
@@ -135,6 +136,25 @@ def _run(
     iterations: Annotated[
         int, typer.Option(min=0, help="Refinement iterations per frame; 0: the server's default.")
     ] = 0,
+    output: Annotated[
+        list[Output] | None,
+        typer.Option(help="Map to write for every frame; may be repeated. Default: disparity."),
+    ] = None,
+    form: Annotated[
+        ResultFormat, typer.Option("--format", help="File format: png16, pfm or npz.")
+    ] = ResultFormat.PNG16,
+    min_confidence: Annotated[
+        int, typer.Option(min=0, max=255, help="Leave out less certain values.")
+    ] = 0,
+    min_depth: Annotated[
+        float, typer.Option(min=0, help="Leave out what is nearer, in metres.")
+    ] = 0.0,
+    max_depth: Annotated[
+        float, typer.Option(min=0, help="Leave out what is farther, in metres.")
+    ] = math.inf,
+    speckle: Annotated[
+        int, typer.Option(min=0, help="Leave out regions of up to so many pixels.")
+    ] = 0,
     pictures: Annotated[
         bool | None,
         typer.Option(
@@ -148,11 +168,16 @@ def _run(
 
     The files are 16-bit PNG in KITTI's convention (x256, 0 = no value): 0000.png, 0001.png, ...
     for a sequence, disp.png for a pair. Images and cameras with --calib, or --fx and --baseline,
-    give depth too: depth/0000.png or depth.png, metres x256.
+    give depth too: depth/0000.png or depth.png, metres x256. rig.json is the rectified rig. The
+    results of an earlier run in the same folder are replaced.
     """
+    from vergence.cli.result_folder import Files, KeptValues
     from vergence.cli.run import run
     from vergence.cli.sources import CalibrationFlags
 
+    if form is ResultFormat.MP4:
+        raise CliError("--format mp4 is for vergence batch; run writes png16, pfm or npz")
+    kept = KeptValues(min_confidence, min_depth, max_depth, speckle)
     _await(
         run(
             source,
@@ -162,6 +187,7 @@ def _run(
             rate=rate,
             frames=frames,
             iterations=iterations,
+            files=Files(output or (), form, kept),
             pictures=pictures,
             json=json,
             console=_console(),

@@ -18,11 +18,12 @@ from vergence.cli.errors import CliError
 from vergence.cli.json_file import write_json
 from vergence.cli.local_server import local_server
 from vergence.cli.progress import progress_bar
+from vergence.cli.result_folder import make_room
 from vergence.cli.sequence_jobs import Job, Query, SequenceService
 from vergence.cli.uploads import Upload, find_uploads
 from vergence.transports.http import http_client
 from vergence_proto.errors import DepthError
-from vergence_proto.jobs import JobState
+from vergence_proto.jobs import JobState, ResultFormat
 
 # So many are packed and sent at once; the server runs them one after the other.
 _AT_ONCE = 3
@@ -55,6 +56,9 @@ async def batch(
     Raises CliError: there is nothing to send, no server, or (at the end) some sequences failed.
     """
     uploads = find_uploads(list(paths))
+    if form != ResultFormat.MP4:
+        for upload in uploads:
+            make_room(out / upload.name)
     if server is None:
         async with local_server(scheme="http", pixels=_LARGEST_PIXELS) as address:
             outcomes, seconds = await _send(uploads, address, out, form, query, console)
@@ -63,11 +67,16 @@ async def batch(
         outcomes, seconds = await _send(uploads, address, out, form, query, console)
     console.print(f"results    {out}")
     console.print(_table(outcomes, seconds))
+    for each in outcomes:
+        for note in each.job.notes if each.job else ():
+            console.print(f"[yellow]note[/]       {each.name}: {note}", soft_wrap=True)
     if json is not None:
         write_json(json, _figures(outcomes, seconds))
     failed = [outcome for outcome in outcomes if outcome.error]
     if failed:
         raise CliError(f"{len(failed)} of {len(outcomes)} sequences failed; the table says why")
+    if unread := sum(outcome.job.frames_unread for outcome in outcomes if outcome.job):
+        raise CliError(f"{unread} frames could not be read; the results of all others are written")
 
 
 async def _send(
@@ -143,6 +152,7 @@ def _figures(outcomes: Sequence[Outcome], seconds: float) -> Mapping[str, Any]:
                 "frames": each.job.frames if each.job else 0,
                 "fps": each.job.fps if each.job else None,
                 "accuracy": each.job.accuracy if each.job else None,
+                "frames_unread": each.job.frames_unread if each.job else 0,
                 "error": each.error,
             }
             for each in outcomes

@@ -19,6 +19,10 @@ class Report:
     accuracies: list[Accuracy] = field(default_factory=list)
     seconds: float = 0.0
     drops: Drops = field(default_factory=Drops)
+    kept_shares: list[float] = field(default_factory=list)
+    """The share of each frame's values that filters kept."""
+    frames_unread: int = 0
+    """Frames of which a file could not be read."""
 
     def add(self, latency_s: float, model_s: float, accuracy: Accuracy | None) -> None:
         self.latencies_s.append(latency_s)
@@ -39,6 +43,8 @@ class Report:
         return {
             "frames": len(self.latencies_s),
             "frames_dropped": self.drops.total,
+            "frames_unread": self.frames_unread,
+            "kept_pct": self.kept_pct,
             "fps": self.fps,
             "latency_first_ms": first_ms,
             "latency_p50_ms": p50_ms,
@@ -47,6 +53,11 @@ class Report:
             "d1_pct": mean.d1_pct if mean else None,
             "d3_pct": mean.d3_pct if mean else None,
         }
+
+    @property
+    def kept_pct(self) -> float:
+        """The mean share of values that filters kept, in percent."""
+        return 100 * float(np.mean(self.kept_shares)) if self.kept_shares else 100.0
 
     @property
     def fps(self) -> float:
@@ -62,6 +73,8 @@ class Report:
         table.add_row("frames", str(len(self.latencies_s)), "answered")
         if self.drops.total:
             table.add_row("dropped", str(self.drops.total), _by_place(self.drops))
+        if self.kept_pct < 100:
+            table.add_row("kept", f"{self.kept_pct:.1f} %", "of the values, after the filters")
         table.add_row("fps", f"{self.fps:.1f}", "end to end")
         table.add_row("first frame", f"{first_ms:.1f} ms", "cold: from sending it to its depth")
         if len(self.latencies_s) > 1:

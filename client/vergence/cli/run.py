@@ -5,30 +5,34 @@ import signal
 import time
 from collections.abc import AsyncGenerator, Iterator, Sequence
 from contextlib import aclosing, contextmanager, nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rich.console import Console
 from rich.progress import TaskID
 
-from vergence.cli.captions import WITH_SIGMA, row_of, shown_in_sheet, title_of, write_sheet
+from vergence.cli.captions import row_of, shown_in_sheet, title_of, write_sheet
 from vergence.cli.errors import CliError
 from vergence.cli.json_file import write_json
 from vergence.cli.local_server import server_for
 from vergence.cli.pictures import Row
 from vergence.cli.progress import progress_bar
 from vergence.cli.report import Report
+from vergence.cli.result_folder import Files, KeptValues, ResultFolder, make_room
 from vergence.cli.sources import CalibrationFlags, Footage, footage_at
 from vergence.cli.streaming import AnsweredFrame, every_frame, live_frames
 from vergence.client import DepthClient
 from vergence.session import DepthSession
+from vergence.transports.addresses import on_this_machine
 from vergence_proto.accuracy import Accuracy
-from vergence_proto.datasets import DatasetError, SourceFrame, write_disparity_png
+from vergence_proto.datasets import SourceFrame
+from vergence_proto.jobs import Output
 from vergence_proto.ordered import in_order
-from vergence_proto.types import Delivery
+from vergence_proto.types import Delivery, OutputFormat
 
 # So many files may be in writing while the next frames are stepped.
 _WRITES_AT_ONCE = 4
+_NAMED_AT_MOST = 10
 
 
 async def run(
@@ -40,11 +44,12 @@ async def run(
     rate: str,
     frames: int | None,
     iterations: int,
+    files: Files,
     pictures: bool | None,
     json: Path | None,
     console: Console,
 ) -> None:
-    """Stream a source; write one disparity PNG per answered frame.
+    """Stream a source; write the maps of each answered frame.
 
     Pictures are drawn if requested; None: of images and cameras without a calibration of their own.
     """
@@ -53,8 +58,10 @@ async def run(
     drawn = footage.loose if pictures is None else pictures
     count = frames if footage.count is None else min(frames or footage.count, footage.count)
     directory = out or Path("vergence-run") / footage.name
-    results = _Results(directory, footage, kept=shown_in_sheet(count))
-    results.make_directories()
+    outputs = _outputs(files, footage)
+    make_room(directory)
+    folder = ResultFolder(directory, outputs=outputs, form=files.form, alone=footage.alone)
+    results = _Results(folder, files.kept, kept=shown_in_sheet(count))
     for note in _notes(footage):
         console.print(f"[yellow]note[/]       {note}")
     async with (
@@ -65,26 +72,65 @@ async def run(
         client.open_session(
             footage.rig,
             delivery=pace.delivery,
-            output=WITH_SIGMA if drawn else None,
+            output=OutputFormat(
+                confidence=Output.CONFIDENCE in outputs or files.kept.min_confidence > 0,
+                sigma=Output.SIGMA in outputs or drawn,
+                compressed=not on_this_machine(address),
+            ),
             iterations=iterations,
             cold_iterations=iterations if footage.alone else 0,
         ) as session,
     ):
         title = title_of(footage.name, footage.rig, session.model.name)
         rig = session.rig if footage.metric else None
-        try:
-            report = await _stream(session, footage, pace, count, results, console)
-        except DatasetError as error:  # a file in the middle of the sequence
-            raise CliError(str(error), exit_code=2) from None
+        folder.begin(session.rig)
+        report = await _stream(session, footage, pace, count, results, console)
     if drawn and results.rows:
         write_sheet(directory / "sheet.png", title, results.rows, rig)
         console.print(f"picture    {directory / 'sheet.png'}")
-    console.print(f"disparity  {directory}")
-    if footage.has_depth:
-        console.print(f"depth      {results.depth_directory}")
+    console.print(f"{'results':<10} {directory}: {', '.join(outputs)}")
     console.print(report.as_table(title))
+    for note in _notes_after(report, folder):
+        console.print(f"[yellow]note[/]       {note}")
     if json is not None:
         write_json(json, report.as_json())
+    _check_unread(footage, report)
+
+
+def _outputs(files: Files, footage: Footage) -> tuple[Output, ...]:
+    """Return the maps to write. Raises CliError: depth was requested, and there is none."""
+    usual = (Output.DISPARITY, Output.DEPTH) if footage.has_depth else (Output.DISPARITY,)
+    outputs = tuple(dict.fromkeys(files.outputs)) or usual
+    if not footage.metric and (Output.DEPTH in outputs or files.kept.limits_depth):
+        raise CliError(
+            f"{footage.name} has no calibration in metres, so it has no depth", exit_code=2
+        )
+    return outputs
+
+
+def _notes_after(report: Report, folder: ResultFolder) -> Iterator[str]:
+    if folder.beyond:
+        yield (
+            f"{folder.beyond} values of 256 and more do not fit a 16-bit PNG and are left out; "
+            "--format pfm or npz keeps them"
+        )
+    if report.accuracies and report.accuracy is None:
+        yield "the ground truth has no value in any frame, so there is nothing to compare with"
+
+
+def _check_unread(footage: Footage, report: Report) -> None:
+    """Raise CliError if a file could not be read; everything else is written by then."""
+    if not footage.unread:
+        return
+    named = "".join(f"\n  {why}" for why in list(footage.unread.values())[:_NAMED_AT_MOST])
+    more = len(footage.unread) - _NAMED_AT_MOST
+    rest = f"\n  and {more} more" if more > 0 else ""
+    if not report.latencies_s:
+        raise CliError(f"no frame could be read:{named}{rest}", exit_code=2)
+    raise CliError(
+        f"{len(footage.unread)} of {footage.count} frames lack a file; the results of all others "
+        f"are written:{named}{rest}"
+    )
 
 
 def _notes(footage: Footage) -> Iterator[str]:
@@ -132,31 +178,25 @@ def _pace(rate: str, footage: Footage) -> _Pace:
 
 
 class _Results:
-    """Write one file per frame, and keep the rows of the sheet."""
+    """Filter and write one result per frame, and keep the rows of the sheet."""
 
-    def __init__(self, directory: Path, footage: Footage, *, kept: list[int]) -> None:
-        self._directory = directory
-        self._footage = footage
+    def __init__(self, folder: ResultFolder, kept_values: KeptValues, *, kept: list[int]) -> None:
+        self._folder = folder
+        self._kept_values = kept_values
         self._kept = kept
         self.rows: list[Row] = []
 
-    def make_directories(self) -> None:
-        self._directory.mkdir(parents=True, exist_ok=True)
-        if self._footage.has_depth:
-            self.depth_directory.mkdir(exist_ok=True)
+    def write(self, answered: AnsweredFrame) -> tuple[AnsweredFrame, Accuracy | None, float]:
+        """Write and score a frame, in a thread: both may take longer than a step.
 
-    @property
-    def depth_directory(self) -> Path:
-        return self._directory if self._footage.alone else self._directory / "depth"
-
-    def write(self, answered: AnsweredFrame) -> tuple[AnsweredFrame, Accuracy | None]:
-        """Write and score a frame, in a thread: both may take longer than a step."""
-        number = f"{answered.index:04d}.png"
-        name, depth_name = ("disp.png", "depth.png") if self._footage.alone else (number, number)
-        write_disparity_png(self._directory / name, answered.result.offset_px)
-        if self._footage.has_depth:  # metres in the same steps of 1/256
-            write_disparity_png(self.depth_directory / depth_name, answered.result.depth_m)
-        return answered, answered.accuracy()
+        Returns the filtered frame, its accuracy before the filters, and the share of its values
+        that they kept.
+        """
+        found = answered.accuracy()
+        result = self._kept_values.of(answered.result)
+        self._folder.write(answered.index, result)
+        share = float(result.valid.sum() / max(answered.result.valid.sum(), 1))
+        return replace(answered, result=result), found, share
 
     def keep_row(self, answered: AnsweredFrame) -> None:
         # Frames may have been dropped: the first one at or after each place is shown.
@@ -187,7 +227,7 @@ async def _stream(
             yield answered
         report.seconds = time.monotonic() - started_s
 
-    async def write(answered: AnsweredFrame) -> tuple[AnsweredFrame, Accuracy | None]:
+    async def write(answered: AnsweredFrame) -> tuple[AnsweredFrame, Accuracy | None, float]:
         return await asyncio.to_thread(results.write, answered)
 
     with progress_bar(console) as progress:
@@ -197,10 +237,12 @@ async def _stream(
         noting = noted(bar)
         writing = in_order(noting, write, limit=_WRITES_AT_ONCE, cancel_rest=False)
         async with aclosing(frames), aclosing(stream), aclosing(noting), aclosing(writing):
-            async for answered, found in writing:
+            async for answered, found, share in writing:
                 report.add(answered.latency_s, answered.result.timings.model_s, found)
+                report.kept_shares.append(share)
                 results.keep_row(answered)
     report.drops = session.drops
+    report.frames_unread = len(footage.unread)
     return report
 
 

@@ -41,6 +41,10 @@ class Job:
     reason: str | None
     """The error code of a failed job."""
     message: str | None
+    frames_unread: int = 0
+    """The number of frames without a result, because an image could not be read."""
+    notes: tuple[str, ...] = ()
+    """What is missing in the upload or does not fit."""
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> Self:
@@ -55,6 +59,8 @@ class Job:
             accuracy=values["accuracy"],
             reason=values["reason"],
             message=values["message"],
+            frames_unread=values.get("frames_unread", 0),
+            notes=tuple(values.get("notes", ())),
         )
 
 

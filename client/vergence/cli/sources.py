@@ -1,7 +1,7 @@
 """What the commands stream: data sets, two images, folders of images, and cameras."""
 
 from collections.abc import AsyncGenerator, Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -102,6 +102,8 @@ class Footage:
     command line has calibrated them, depth is written."""
     notes: tuple[str, ...] = ()
     """What a user should know of these frames."""
+    unread: dict[int, str] = field(default_factory=dict)
+    """Why a file of a frame could not be read, by its index; filled while frames are read."""
 
     @property
     def has_depth(self) -> bool:
@@ -174,16 +176,22 @@ def _camera(place: str, flags: CalibrationFlags) -> Footage:
 
 
 def _footage(source: StereoSource, *, loose: bool = False) -> Footage:
+    unread: dict[int, str] = {}
+
+    def skip(index: int, error: DatasetError) -> None:
+        unread[index] = str(error)
+
     return Footage(
         source.name,
         source.rig,
         source.fps,
         len(source),
-        partial(read_ahead, source),
+        partial(read_ahead, source, on_unreadable=skip),
         alone=source.is_single_pair,
         metric=source.metric,
         loose=loose,
         notes=source.notes,
+        unread=unread,
     )
 
 

@@ -8,7 +8,8 @@ after the results of its frames have been written.
 import dataclasses
 import json
 import os
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from vergence_proto.accuracy import Accuracy
@@ -24,6 +25,9 @@ class Checkpoint:
     state: RecurrentState  # state after these frames
     weights_sha256: str  # weights that the state belongs to
     measured: tuple[Accuracy, ...]  # accuracy of the frames with ground truth
+    unread: Mapping[int, str] = field(
+        default_factory=dict
+    )  # why a file could not be read, by index
 
 
 def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
@@ -32,6 +36,7 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "frames": checkpoint.frames,
         "weights_sha256": checkpoint.weights_sha256,
         "measured": [dataclasses.asdict(each) for each in checkpoint.measured],
+        "unread": list(checkpoint.unread.items()),
     }
     unfinished = path.with_suffix(".new")
     unfinished.write_bytes(json.dumps(about).encode() + b"\n" + state_to_bytes(checkpoint.state))
@@ -48,6 +53,7 @@ def read_checkpoint(path: Path) -> Checkpoint | None:
             state=state_from_bytes(state),
             weights_sha256=about["weights_sha256"],
             measured=tuple(Accuracy(**each) for each in about["measured"]),
+            unread=dict(about.get("unread", [])),
         )
     except (FileNotFoundError, KeyError, TypeError, ValueError):  # BadSnapshot is a ValueError
         return None

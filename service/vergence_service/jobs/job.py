@@ -34,6 +34,8 @@ class Job:
     fps: float | None = None
     disk_bytes: int = 0  # space reserved until the job ends, then space used
     accuracy: Mapping[str, float] | None = None
+    frames_unread: int = 0  # frames without a result, because an image could not be read
+    notes: tuple[str, ...] = ()  # what is missing in the upload or does not fit
     reason: str | None = None  # ErrorCode of the failure
     message: str | None = None
 
@@ -53,4 +55,5 @@ def job_from_json(document: str) -> Job:
     options = values.pop("options")
     outputs = tuple(map(Output, options.pop("outputs")))
     state = JobState(values.pop("state"))
-    return Job(**values, state=state, options=JobOptions(**options, outputs=outputs))
+    notes = tuple(values.pop("notes", ()))  # jobs of older servers have none
+    return Job(**values, notes=notes, state=state, options=JobOptions(**options, outputs=outputs))

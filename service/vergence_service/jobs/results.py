@@ -4,7 +4,9 @@
 
     result/rig.json         the rectified rig of the maps
     result/000000.npz       offset_px float32 [H, W], NaN where there is no value; confidence uint8
-                            [H, W] if the job asked for it
+                            [H, W] and sigma_px float32 [H, W] if the job asked for them
+
+A frame that could not be read has no file.
 
 Disparity here is the pixel offset u_left - u_right in the images, as in the files of
 ``vergence run`` and of the data sets. Depth takes the principal points into account.
@@ -24,10 +26,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vergence_proto.datasets import StereoSource, encode_disparity_png, encode_pfm
+from vergence_proto.datasets import StereoSource
 from vergence_proto.film import CannotFilm, FilmWriter
 from vergence_proto.geometry import RectifiedRig
 from vergence_proto.jobs import Output, ResultFormat
+from vergence_proto.result_files import encode_maps
 from vergence_proto.types import DisparityMap, Plane
 
 _RIG = "rig.json"
@@ -47,6 +50,7 @@ class FrameResult:
     rig: RectifiedRig
     offset_px: Plane
     confidence: NDArray[np.uint8] | None
+    sigma_px: Plane | None
 
     @property
     def depth_m(self) -> Plane:
@@ -67,20 +71,28 @@ def write_frame(folder: Path, index: int, disparity: DisparityMap) -> None:
     arrays: dict[str, NDArray[Any]] = {"offset_px": disparity.offset_px}
     if disparity.confidence is not None:
         arrays["confidence"] = disparity.confidence
+    if disparity.sigma_px is not None:
+        arrays["sigma_px"] = disparity.sigma_px
     np.savez(folder / f"{index:06d}.npz", allow_pickle=False, **arrays)
 
 
 def result_bytes(sequence: StereoSource, outputs: Collection[Output]) -> int:
     """Return the disk space that the result of a sequence will need."""
     pixels = sequence.rig.left.width * sequence.rig.left.height
-    return len(sequence) * pixels * (5 if Output.CONFIDENCE in outputs else 4)
+    bytes_a_pixel = 4 + (Output.CONFIDENCE in outputs) + 4 * (Output.SIGMA in outputs)
+    return len(sequence) * pixels * bytes_a_pixel
 
 
-def holds_frames(folder: Path, count: int) -> bool:
-    """Check that the first ``count`` files are complete; a crash may have cut off the last."""
+def holds_frames(folder: Path, count: int, *, without: Collection[int] = ()) -> bool:
+    """Check that the first ``count`` files are complete; a crash may have cut off the last.
+
+    Frames of the indices ``without`` may have no file.
+    """
     try:
         RectifiedRig(**json.loads((folder / _RIG).read_text("utf-8")))
         for index in range(count):
+            if index in without and not (folder / f"{index:06d}.npz").exists():
+                continue
             with zipfile.ZipFile(folder / f"{index:06d}.npz") as file:
                 if file.testzip() is not None:
                     return False
@@ -89,12 +101,22 @@ def holds_frames(folder: Path, count: int) -> bool:
     return True
 
 
-def read_frames(folder: Path) -> Iterator[FrameResult]:
-    """Read the results in the order of the frames."""
+def count_frames(folder: Path) -> int:
+    """Return the number of frames that have a result."""
+    return sum(1 for _ in folder.glob("*.npz"))
+
+
+def read_frames(folder: Path) -> Iterator[tuple[int, FrameResult]]:
+    """Read index and result of each frame that has one, in order."""
     rig = RectifiedRig(**json.loads((folder / _RIG).read_text("utf-8")))
     for path in sorted(folder.glob("*.npz")):
         with np.load(path) as arrays:
-            yield FrameResult(rig, arrays["offset_px"], arrays.get("confidence"))
+            yield (
+                int(path.stem),
+                FrameResult(
+                    rig, arrays["offset_px"], arrays.get("confidence"), arrays.get("sigma_px")
+                ),
+            )
 
 
 def zip_of(folder: Path, form: ResultFormat, outputs: Collection[Output]) -> Iterator[bytes]:
@@ -102,9 +124,10 @@ def zip_of(folder: Path, form: ResultFormat, outputs: Collection[Output]) -> Ite
     sink = _Sink()
     with zipfile.ZipFile(sink, "w") as archive:
         archive.writestr(_RIG, (folder / _RIG).read_bytes())
-        for index, frame in enumerate(read_frames(folder)):
-            for name, content in _files(frame, form, outputs):
-                archive.writestr(name.format(index), content)
+        for index, frame in read_frames(folder):
+            for file in encode_maps(_maps(frame, outputs), form):
+                folder_of = "" if file.output is None else f"{file.output}/"
+                archive.writestr(f"{folder_of}{index:04d}{file.suffix}", file.content)
             yield sink.take()
     yield sink.take()
 
@@ -116,49 +139,22 @@ def mp4_of(folder: Path, *, fps: float) -> Iterator[bytes]:
     """
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "disparity.mp4"
-        for _ in _writing_mp4(path, (frame.offset_px for frame in read_frames(folder)), fps):
+        for _ in _writing_mp4(path, (frame.offset_px for _, frame in read_frames(folder)), fps):
             yield b""
         with path.open("rb") as file:
             while chunk := file.read(_CHUNK):
                 yield chunk
 
 
-def _files(
-    frame: FrameResult, form: ResultFormat, outputs: Collection[Output]
-) -> Iterator[tuple[str, bytes]]:
-    planes: dict[Output, Callable[[], Plane]] = {
+def _maps(frame: FrameResult, outputs: Collection[Output]) -> Mapping[Output, NDArray[Any]]:
+    planes: Mapping[Output, Callable[[], NDArray[Any] | None]] = {
         Output.DISPARITY: lambda: frame.offset_px,
         Output.DEPTH: lambda: frame.depth_m,
+        Output.CONFIDENCE: lambda: frame.confidence,
+        Output.SIGMA: lambda: frame.sigma_px,
     }
-    if form is ResultFormat.NPZ:
-        arrays: dict[str, NDArray[Any]] = {
-            name: plane() for name, plane in planes.items() if name in outputs
-        }
-        if frame.confidence is not None:
-            arrays[Output.CONFIDENCE] = frame.confidence
-        yield "{:04d}.npz", _npz(arrays)
-        return
-    encode, extension = _ENCODERS[form]
-    for name, plane in planes.items():
-        if name in outputs:
-            yield f"{name}/{{:04d}}.{extension}", encode(plane())
-    if frame.confidence is not None:
-        done, file = cv2.imencode(".png", frame.confidence)
-        if not done:
-            raise CannotEncode("OpenCV cannot write PNG here")
-        yield f"{Output.CONFIDENCE}/{{:04d}}.png", file.tobytes()
-
-
-_ENCODERS: Mapping[ResultFormat, tuple[Callable[[Plane], bytes], str]] = {
-    ResultFormat.PNG16: (encode_disparity_png, "png"),
-    ResultFormat.PFM: (encode_pfm, "pfm"),
-}
-
-
-def _npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
-    file = io.BytesIO()
-    np.savez(file, allow_pickle=False, **arrays)
-    return file.getvalue()
+    maps = ((output, plane()) for output, plane in planes.items() if output in outputs)
+    return {output: map_ for output, map_ in maps if map_ is not None}
 
 
 def _writing_mp4(path: Path, frames: Iterator[Plane], fps: float) -> Iterator[None]:

@@ -30,9 +30,9 @@ def find_sequence(folder: Path, source: str | None) -> tuple[str, StereoSource]:
     for kind in DATASETS:
         for spec in find_sources(f"{kind}:{folder}"):
             try:
-                found.append((_relative(spec, folder), open_source(spec)))
+                found.append((relative_text(spec, folder), open_source(spec)))
             except DatasetError as error:
-                trouble.append(_relative(str(error), folder))
+                trouble.append(relative_text(str(error), folder))
     if not found:
         why = f" ({trouble[0]})" if trouble else ""
         raise BadSequence(f"expected a sequence in one of {', '.join(DATASETS)}, found none{why}")
@@ -66,8 +66,9 @@ def _not_empty(source: str, sequence: StereoSource) -> tuple[str, StereoSource]:
 
 def sequence_error(error: DatasetError, folder: Path) -> BadSequence:
     """Return the error about a file below ``folder``, without the server's own path."""
-    return BadSequence(_relative(str(error), folder))
+    return BadSequence(relative_text(str(error), folder))
 
 
-def _relative(text: str, folder: Path) -> str:
+def relative_text(text: str, folder: Path) -> str:
+    """Return text about files below ``folder``, without the server's own path."""
     return text.replace(f"{folder}/", "").replace(str(folder), "")

@@ -1,11 +1,11 @@
 """Step a whole sequence: a pure function of its frames and the model."""
 
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Callable
 from contextlib import aclosing
 from dataclasses import dataclass
 from functools import partial
 
-from vergence_proto.datasets import SourceFrame, StereoSource, read_ahead
+from vergence_proto.datasets import DatasetError, SourceFrame, StereoSource, read_ahead
 from vergence_proto.ordered import in_order
 from vergence_proto.types import DisparityMap
 from vergence_service.inference.model import RecurrentState
@@ -33,19 +33,26 @@ async def step_all(
     *,
     start: int = 0,
     state: RecurrentState | None = None,
+    on_unreadable: Callable[[int, DatasetError], None] | None = None,
 ) -> AsyncGenerator[Stepped, None]:
     """Step the frames of ``sequence`` in order, each from the state after the frame before.
 
-    Stepping begins at frame ``start``, from ``state``, the state after the frame before it.
+    Stepping begins at frame ``start``, from ``state``, the state after the frame before it. A frame
+    that cannot be read is left out, and ``on_unreadable`` gets its index and the error.
 
     Raises NotReady or Draining if the server accepts no work; BadCalibration, FrameTooLarge,
-    BadShape, ModelFailed or NonFinite if a frame cannot be stepped; and DatasetError if a file
-    cannot be read.
+    BadShape, ModelFailed or NonFinite if a frame cannot be stepped; and, without ``on_unreadable``,
+    DatasetError if a file cannot be read.
     """
     async with (
         engine.offline(config, state=state) as stream,
         aclosing(
-            read_ahead(sequence, start=start, in_thread=engine.threads.background.run)
+            read_ahead(
+                sequence,
+                start=start,
+                in_thread=engine.threads.background.run,
+                on_unreadable=on_unreadable,
+            )
         ) as frames,
         aclosing(in_order(frames, partial(_step, engine, stream), limit=_IN_FLIGHT)) as steps,
     ):

@@ -129,8 +129,15 @@ class JobWorker:
         except Exception:
             log.exception("sequence %s failed with an unexpected error", job.job_id)
             return _failed(started, ModelFailed("the server failed; its log has the reason"))
-        accuracy = None if found is None else asdict(found)
-        return replace(started, state=JobState.DONE, fps=progress.fps or None, accuracy=accuracy)
+        accuracy = None if found.accuracy is None else asdict(found.accuracy)
+        return replace(
+            started,
+            state=JobState.DONE,
+            fps=progress.fps or None,
+            accuracy=accuracy,
+            frames_unread=found.frames_unread,
+            notes=found.notes,
+        )
 
     def _count_ended(self, job: Job, progress: JobProgress) -> None:
         if job.state is JobState.DONE:

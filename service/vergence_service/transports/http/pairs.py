@@ -2,12 +2,11 @@
 
 import io
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
-import cv2
 import numpy as np
 from fastapi import APIRouter, Query, Request, Response
 from numpy.typing import NDArray
@@ -16,12 +15,17 @@ from pydantic import BaseModel, ConfigDict, Field
 from vergence_proto.datasets import DatasetError, beyond_png, encode_disparity_png, read_image
 from vergence_proto.errors import BadCalibration, BadImage, BadShape, FrameTooLarge
 from vergence_proto.geometry import RectifiedRig
+from vergence_proto.result_files import (
+    beyond_mm_png,
+    encode_confidence_png,
+    encode_depth_mm_png,
+    encode_sigma_png,
+)
 from vergence_proto.types import (
     Delivery,
     DisparityMap,
     Image,
     OutputFormat,
-    Plane,
     StereoFrame,
     StereoRig,
 )
@@ -44,7 +48,9 @@ class PairFormat(StrEnum):
     """The file format of the answer."""
 
     PNG16 = "png16"  # value times 256, 0 where there is no value (the KITTI convention)
+    PNG16MM = "png16mm"  # depth in millimetres, 0 where there is no value
     NPY = "npy"  # float32, NaN where there is no value
+    NPZ = "npz"  # every map, by its name
 
 
 class PairOutput(StrEnum):
@@ -53,6 +59,7 @@ class PairOutput(StrEnum):
     DISPARITY = "disparity"
     DEPTH = "depth"
     CONFIDENCE = "confidence"
+    SIGMA = "sigma"
 
 
 class PairQuery(BaseModel):
@@ -64,7 +71,8 @@ class PairQuery(BaseModel):
     output: PairOutput = Field(
         default=PairOutput.DISPARITY,
         description="depth is in metres and needs fx_px and baseline_m; confidence is the "
-        "probability of an error below 1 px, times 255, 0 where there is no value",
+        "probability of an error below 1 px, times 255, 0 where there is no value; sigma is the "
+        "expected error in pixels",
     )
     iterations: int = Field(default=0, ge=0, le=64, description="0: as many as a cold start")
     fx_px: float | None = Field(default=None, ge=1, le=1e6)
@@ -92,14 +100,14 @@ _BODY: dict[str, Any] = {
 _ANSWER: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "16-bit PNG (value times 256, 0: no value) or float32 NPY (NaN: no value); "
-        "confidence: 8-bit PNG or uint8 NPY",
+        "confidence: 8-bit PNG or uint8 NPY; png16mm: depth in millimetres; npz: every map",
         "headers": {
             RANGE_HEADER: {
                 "description": "range of the search in pixels; nearer surfaces have no value",
                 "schema": {"type": "number"},
             },
             BEYOND_HEADER: {
-                "description": "pixels whose value a 16-bit PNG cannot hold (256 and above); they "
+                "description": "pixels whose disparity or depth a 16-bit PNG cannot hold; they "
                 "have no value in it, and their value in NPY",
                 "schema": {"type": "integer"},
             },
@@ -140,20 +148,23 @@ def pair_routes(engine: DepthEngine, places: Places, *, limits: UploadLimits) ->
             cy=(height - 1) / 2,
             baseline_m=query.baseline_m or 1.0,
         )
-        if query.output is PairOutput.DEPTH and not (query.fx_px and query.baseline_m):
+        metric = bool(query.fx_px and query.baseline_m)
+        if query.output is PairOutput.DEPTH and not metric:
             raise BadCalibration(
                 "depth needs fx_px and baseline_m; without them, ask for disparity"
             )
+        if query.format is PairFormat.PNG16MM and query.output is not PairOutput.DEPTH:
+            raise BadShape("png16mm is for depth: add output=depth, or ask for png16")
         config = StreamConfig(
             StereoRig.from_rectified(rig),
             delivery=Delivery.EVERY,
-            output=OutputFormat(confidence=query.output is PairOutput.CONFIDENCE),
+            output=OutputFormat(confidence=True, sigma=True),
             cold_iterations=query.iterations,
         )
         frame = StereoFrame(1, 0, left, right)
         async with engine.offline(config) as stream:
             disparity, _ = await engine.step_offline(stream, lambda: frame)
-        return await background.run(_answer, disparity, query)
+        return await background.run(_answer, disparity, query, metric=metric)
 
     return router
 
@@ -190,39 +201,39 @@ def _image(path: Path, name: str, max_pixels: int) -> Image:
         raise BadImage(f"{name} image: {str(error).removeprefix(f'{path}: ')}") from None
 
 
-def _answer(disparity: DisparityMap, query: PairQuery) -> Response:
-    plain = query.format is PairFormat.PNG16
-    match query.output:
-        case PairOutput.CONFIDENCE:
-            assert disparity.confidence is not None  # the stream was opened with it
-            confidence = disparity.confidence
-            response = _png(_encoded_png(confidence)) if plain else _npy(confidence)
-        case PairOutput.DEPTH:
-            depth_m = disparity.depth_m
-            response = _png16(depth_m) if plain else _npy(depth_m)
-        case PairOutput.DISPARITY:
-            disparity_px = disparity.disparity_px
-            response = _png16(disparity_px) if plain else _npy(disparity_px)
+def _answer(disparity: DisparityMap, query: PairQuery, *, metric: bool) -> Response:
+    maps: dict[PairOutput, NDArray[Any]] = {PairOutput.DISPARITY: disparity.disparity_px}
+    if metric:
+        maps[PairOutput.DEPTH] = disparity.depth_m
+    if disparity.confidence is not None and disparity.sigma_px is not None:
+        maps[PairOutput.CONFIDENCE] = disparity.confidence
+        maps[PairOutput.SIGMA] = disparity.sigma_px
+    wanted = maps[query.output]
+    match query.format:
+        case PairFormat.NPZ:
+            response = _binary(lambda file: np.savez(file, allow_pickle=False, **maps))
+        case PairFormat.NPY:
+            response = _binary(lambda file: np.save(file, wanted, allow_pickle=False))
+        case PairFormat.PNG16MM:
+            response = _png(encode_depth_mm_png(wanted), beyond=beyond_mm_png(wanted))
+        case PairFormat.PNG16 if query.output is PairOutput.CONFIDENCE:
+            response = _png(encode_confidence_png(wanted))
+        case PairFormat.PNG16 if query.output is PairOutput.SIGMA:
+            response = _png(encode_sigma_png(wanted))
+        case PairFormat.PNG16:
+            response = _png(encode_disparity_png(wanted), beyond=beyond_png(wanted))
     response.headers[RANGE_HEADER] = f"{disparity.max_disparity_px:g}"
     return response
 
 
-def _png16(values: Plane) -> Response:
-    response = _png(encode_disparity_png(values))
-    response.headers[BEYOND_HEADER] = str(np.count_nonzero(beyond_png(values)))
+def _png(content: bytes, *, beyond: NDArray[np.bool_] | None = None) -> Response:
+    response = Response(content, media_type="image/png")
+    if beyond is not None:
+        response.headers[BEYOND_HEADER] = str(np.count_nonzero(beyond))
     return response
 
 
-def _encoded_png(levels: NDArray[np.uint8]) -> bytes:
-    _, png = cv2.imencode(".png", levels)
-    return png.tobytes()
-
-
-def _png(content: bytes) -> Response:
-    return Response(content, media_type="image/png")
-
-
-def _npy(values: NDArray[np.generic]) -> Response:
+def _binary(save: Callable[[io.BytesIO], None]) -> Response:
     file = io.BytesIO()
-    np.save(file, values, allow_pickle=False)
+    save(file)
     return Response(file.getvalue(), media_type="application/octet-stream")

@@ -48,6 +48,8 @@ _EXAMPLE: dict[str, JsonValue] = {
     "iterations": 0,
     "metrics": False,
     "accuracy": None,
+    "frames_unread": 0,
+    "notes": [],
     "reason": None,
     "message": None,
 }
@@ -101,6 +103,10 @@ class SequenceJob(BaseModel):
     iterations: int
     metrics: bool
     accuracy: dict[str, float] | None = Field(description="mean over the frames with ground truth")
+    frames_unread: int = Field(
+        description="frames without a result, because an image is missing or damaged"
+    )
+    notes: list[str] = Field(description="what is missing in the upload or does not fit")
     reason: ErrorCode | None = Field(description="code of the failure")
     message: str | None
 
@@ -121,6 +127,8 @@ class SequenceJob(BaseModel):
             iterations=job.options.iterations,
             metrics=job.options.metrics,
             accuracy=None if job.accuracy is None else dict(job.accuracy),
+            frames_unread=job.frames_unread,
+            notes=list(job.notes),
             reason=None if job.reason is None else ErrorCode(job.reason),
             message=job.message,
         )
