@@ -136,7 +136,7 @@ class StreamLimit(DepthError):
 
 
 class StateMemory(DepthError):
-    """The states of all streams together would exceed the configured memory."""
+    """The server's memory does not suffice: its configured limit, or the process's own."""
 
     code = ErrorCode.STATE_MEMORY
 

@@ -40,6 +40,14 @@ class Metrics:
             buckets=(1, 2, 4, 8, 16, 32),
             registry=registry,
         )
+        self.decoder_messages = Counter(
+            "vergence_decoder_messages",
+            "Lines that image decoders wrote about damaged images",
+            ["decoder"],
+            registry=registry,
+        )
+        for decoder in ("jpeg", "png"):
+            self.decoder_messages.labels(decoder)
         self.streams_open = Gauge("vergence_streams_open", "Open streams", registry=registry)
         self.streams_predicted = Gauge(
             "vergence_streams_predicted",

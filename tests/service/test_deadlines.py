@@ -20,6 +20,7 @@ from tests.support.http import http_to
 from tests.support.http import reason_of as reason_over_http
 from tests.support.models import RecallModel
 from tests.support.polling import eventually, eventually_true
+from tests.support.proxy import proxy_to
 from tests.support.server import (
     PATIENCE_S,
     ManualClock,
@@ -356,3 +357,24 @@ def test_descriptors_are_raised_and_connections_are_fewer_if_they_are_scarce() -
         [sys.executable, "-c", code], preexec_fn=scarce, capture_output=True, text=True, check=True
     ).stdout
     assert printed.split() == ["92", "20", "8"]
+
+
+async def test_a_client_that_dies_while_it_is_sent_an_answer_is_no_failure_of_the_server(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level("INFO")
+    async with (
+        running_server(RecallModel()) as server,
+        proxy_to(server.grpc_address) as proxy,
+        grpc.aio.insecure_channel(proxy.address, options=SMALL_WINDOW) as channel,
+    ):
+        call = RawCall(depth_pb2_grpc.DepthServiceStub(channel).StreamDepth())
+        opening = open_message(rig=StereoRig.from_rectified(LARGE))
+        stream = server.engine.streams.get((await call.ask(opening)).opened.stream_id)
+        for frame_id in range(1, 5):
+            await call.send(frame_message(make_frame(frame_id, rig=LARGE)))
+        await eventually(lambda: stream.frames_stepped >= 2)  # the answer before is being sent
+        proxy.cut()
+        await eventually(lambda: stream.attachment is None)
+    assert not [record for record in caplog.records if record.exc_info]
+    assert "disconnected while it was sent an answer" in caplog.text

@@ -14,6 +14,7 @@ from vergence_proto.model_io import ManifestError
 from vergence_service.app.server import Running, serve
 from vergence_service.descriptors import raise_descriptor_limit
 from vergence_service.inference.providers import ProviderUnavailable
+from vergence_service.logs import start_logging
 from vergence_service.malloc import keep_freed_memory
 from vergence_service.settings import SettingsError, load_settings
 from vergence_service.transports.errors import ExtraMissing, PortTaken, ZenohUnreachable
@@ -47,11 +48,7 @@ def run_server(
         if print_config:
             sys.stdout.write(settings.to_toml())
             return
-        logging.basicConfig(
-            level=settings.log_level.upper(),
-            format="%(asctime)s %(levelname)s %(name)s %(message)s",
-        )
-        logging.getLogger("uvicorn.error").setLevel(logging.WARNING)  # says "started" too early
+        start_logging(settings.log_level)
         keep_freed_memory()
         raise_descriptor_limit()
         ending = partial(_end_after, 2 * settings.server.drain_s)

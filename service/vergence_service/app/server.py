@@ -22,6 +22,7 @@ from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weig
 from vergence_service.jobs.queue import JobQueue
 from vergence_service.memory import MemoryBudget, affordable_bytes
 from vergence_service.metrics import Metrics
+from vergence_service.native_output import native_output
 from vergence_service.settings import Settings
 from vergence_service.streams.continuity import ContinuityLimits
 from vergence_service.streams.engine import DepthEngine
@@ -201,11 +202,13 @@ async def serve(
         on_end_of_input(stop_serving)
     with closing(make_model(settings)) as model:
         async with running(settings, model) as server:
-            on_serving(server)
-            # A graph that cannot be loaded ends the server; its error leaves `running`.
-            server.loading.add_done_callback(lambda task: stop.set() if _failed(task) else None)
-            await stop.wait()
-            await drain(server, within_s=settings.server.drain_s)
+            messages = server.engine.metrics.decoder_messages
+            with native_output(lambda decoder: messages.labels(decoder).inc()):
+                on_serving(server)
+                # A graph that cannot be loaded ends the server; its error leaves `running`.
+                server.loading.add_done_callback(lambda task: stop.set() if _failed(task) else None)
+                await stop.wait()
+                await drain(server, within_s=settings.server.drain_s)
 
 
 async def drain(server: Running, *, within_s: float) -> None:

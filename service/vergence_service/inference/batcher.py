@@ -15,6 +15,7 @@ from typing import Self
 
 from vergence_proto.errors import DepthError, Draining, FrameStale, ModelFailed
 from vergence_proto.types import Timings
+from vergence_service.failures import out_of_memory
 from vergence_service.inference.arrivals import ArrivalPredictor
 from vergence_service.inference.model import Step, StepResult, StereoModel
 from vergence_service.memory import MemoryBudget
@@ -248,7 +249,9 @@ def _unanswered(items: Sequence[_Waiting]) -> list[_Waiting]:
 def _fail(item: _Waiting, error: Exception) -> None:
     if item.answer.done():
         return
-    if not isinstance(error, DepthError):
+    if isinstance(error, MemoryError):
+        error = out_of_memory()
+    elif not isinstance(error, DepthError):
         log.error("the model raised", exc_info=error)
         error = ModelFailed("the model failed on this frame; the stream is unchanged")
     item.answer.set_exception(error)

@@ -135,7 +135,7 @@ class StereoModel(Protocol):
 
         All steps have one image size and one iteration count, and either all or none are cold.
 
-        Raises NonFinite if the result of any row is not finite.
+        Raises NonFinite if the result of any row is not finite, and MemoryError.
         """
         ...
 

@@ -1,11 +1,13 @@
 """A stereo model that runs as ONNX graphs in onnxruntime."""
 
 import importlib.util
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from onnxruntime.capi.onnxruntime_pybind11_state import RuntimeException as OrtError
 
 from vergence_proto.errors import NonFinite
 from vergence_proto.model_io import (
@@ -27,6 +29,9 @@ from vergence_service.inference.providers import (
     require_provider,
 )
 
+# What onnxruntime says if an allocation fails: its arena, and C++.
+_NO_MEMORY = re.compile("Failed to allocate memory|bad_alloc|bad allocation|Available memory of")
+
 # The memory of a step: pixels * (bytes per pixel + bytes per column * columns), for the graphs of
 # `lite` relate every pixel of a row to every other. Upper bounds, measured on a CPU;
 # tests/service/test_step_memory.py measures again.
@@ -35,7 +40,7 @@ _ANY_STEP = (110.0, 0.07)
 _SAVING = (70.0, 0.045)  # any step, if it saves memory
 _BESIDE_PIXELS = 12 << 20
 # A step that would need more than this saves memory.
-_LARGE_STEP = 512 << 20
+_LARGE_STEP = 320 << 20
 
 
 class OnnxStereoModel:
@@ -118,12 +123,17 @@ class OnnxStereoModel:
         height, width = steps[0].view.left.shape[:2]
         step_height, step_width = self._card.step_size(height, width)
         pixels = step_height * step_width
-        found = self._graphs.run(
-            steps[0].iterations,
-            self._feeds(steps),
-            cold_pixels=pixels if steps[0].cold else None,
-            save_memory=_bytes_of(_ANY_STEP, pixels, step_width) > _LARGE_STEP,
-        )
+        try:
+            found = self._graphs.run(
+                steps[0].iterations,
+                self._feeds(steps),
+                cold_pixels=pixels if steps[0].cold else None,
+                save_memory=_bytes_of(_ANY_STEP, pixels, step_width) > _LARGE_STEP,
+            )
+        except OrtError as error:
+            if _NO_MEMORY.search(str(error)):
+                raise MemoryError(f"a step of {width}x{height}") from None
+            raise
         # States on a device are not checked: a bad value would show in the maps of the next step.
         to_check = [values for values in found.values() if not isinstance(values, DeviceTensor)]
         if not all(np.isfinite(values).all() for values in to_check):

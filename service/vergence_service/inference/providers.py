@@ -80,6 +80,7 @@ def start_session(
         options.add_session_config_entry("session.use_env_allocators", "1")
         # A pattern is one more buffer, as large as the peak of a step, for each size of image.
         options.enable_mem_pattern = False
+    options.log_severity_level = 4  # fatal: what is less is raised
     session = onnxruntime.InferenceSession(graph, options, providers=list(providers))
     # onnxruntime falls back to the CPU with a warning. A server must not do so silently.
     if session.get_providers()[0] != providers[0]:

@@ -21,6 +21,7 @@ from vergence_proto.types import (
     StereoRig,
     Timings,
 )
+from vergence_service.failures import out_of_memory
 from vergence_service.inference.batcher import StepBatcher
 from vergence_service.inference.model import RecurrentState, Step, StereoModel, StereoView
 from vergence_service.memory import MemoryBudget, StreamMemory
@@ -297,7 +298,10 @@ class DepthEngine:
         )
 
     async def _rectifier(self, rig: StereoRig) -> Rectifier:
-        return await self.threads.background.run(Rectifier.of, rig, self._reach)
+        try:
+            return await self.threads.background.run(Rectifier.of, rig, self._reach)
+        except MemoryError:
+            raise out_of_memory() from None
 
     async def _step(
         self,
@@ -351,5 +355,8 @@ class DepthEngine:
 def _decoded_view(
     decode: Callable[[], StereoFrame], stream: Stream
 ) -> tuple[StereoFrame, StereoView]:
-    frame = decode()
-    return frame, view_from_frame(frame, stream.rectifier, stream.config.axes)
+    try:
+        frame = decode()
+        return frame, view_from_frame(frame, stream.rectifier, stream.config.axes)
+    except MemoryError:
+        raise out_of_memory() from None

@@ -1,5 +1,7 @@
 """Rectify the images of any rig, with maps that are made once per stream."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Self
 
@@ -12,6 +14,7 @@ from vergence_proto.geometry import Matrix, Pose, RectifiedRig
 from vergence_proto.types import Distortion, Image, Intrinsics, Plane, StereoRig
 from vergence_service.streams.search_window import SearchReach, SearchWindow
 
+_OUT_OF_MEMORY = -4  # cv::Error::StsNoMem
 _WIDEST_VIEW_DEG = 110.0
 _KEPT_SHARE = 0.8  # of the least focal length: OpenCV's choice is kept down to this
 _LOOKS_AHEAD = 0.2  # cosine of the angle between an original and the rectified axis
@@ -46,8 +49,9 @@ def check_rig(rig: StereoRig, reach: SearchReach) -> None:
     """
     rectified = rig.as_rectified()
     if rectified is None:
-        cameras = _rectified_cameras(rig)
-        _seen(_left_maps(rig, cameras))
+        with _opencv_errors():
+            cameras = _rectified_cameras(rig)
+            _seen(_left_maps(rig, cameras))
         rectified = cameras.rig
     SearchWindow.of(rectified, reach)
 
@@ -71,7 +75,8 @@ class Rectifier:
         """
         rectified = rig.as_rectified()
         if rectified is None:
-            return cls._from_cameras(rig, reach)
+            with _opencv_errors():
+                return cls._from_cameras(rig, reach)
         return cls(rectified, SearchWindow.of(rectified, reach), Pose.identity())
 
     @classmethod
@@ -86,10 +91,11 @@ class Rectifier:
 
     def rectify(self, left: Image, right: Image) -> tuple[Image, Image]:
         """The pair as the model sees it, from images as the cameras took them."""
-        if self.maps is not None:
-            left_maps, right_maps = self.maps
-            left, right = left_maps.remap(left), right_maps.remap(right)
-        return self.window.images(left, right)
+        with _opencv_errors():
+            if self.maps is not None:
+                left_maps, right_maps = self.maps
+                left, right = left_maps.remap(left), right_maps.remap(right)
+            return self.window.images(left, right)
 
     def disparity_px(self, offset_px: Plane) -> Plane:
         """Disparity [H, W] of ``rig`` from the model's offset.
@@ -104,6 +110,19 @@ class Rectifier:
     def sigma_px(self, sigma_px: Plane) -> Plane:
         """Sigma [H, W] of ``rig`` from the model's."""
         return self.window.sigma_px(sigma_px, self.rig.height, self.rig.width)
+
+
+@contextmanager
+def _opencv_errors() -> Iterator[None]:
+    """Raise BadCalibration for what OpenCV refuses, and MemoryError if it has no memory."""
+    try:
+        yield
+    except cv2.error as error:
+        if error.code == _OUT_OF_MEMORY:
+            raise MemoryError(error.err) from None
+        raise BadCalibration(
+            f"the rig has no rectification: {error.err}; check its intrinsics"
+        ) from None
 
 
 def _rectified_cameras(rig: StereoRig) -> _Cameras:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 from vergence_proto import codec
 from vergence_proto.v1 import depth_pb2 as pb
+from vergence_service.failures import out_of_memory
 from vergence_service.metrics import Metrics
 from vergence_service.streams.conversion import SteppedFrame
 from vergence_service.streams.stream import Notice, NoticeKind
@@ -93,6 +94,13 @@ class Outbox:
                     await self._write(answer)
 
     def _encoded(self, stepped: SteppedFrame) -> pb.StreamDepthResponse:
+        try:
+            return self._encoded_map(stepped)
+        except MemoryError:
+            error = codec.error_to_frame_error(stepped.frame_id, out_of_memory())
+            return pb.StreamDepthResponse(frame_error=error)
+
+    def _encoded_map(self, stepped: SteppedFrame) -> pb.StreamDepthResponse:
         started_s = self._clock()
         response = pb.StreamDepthResponse()
         message = codec.disparity_to_proto(

@@ -2,14 +2,15 @@
 
 import logging
 from collections.abc import AsyncIterator, Mapping
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from typing import Any
 
 import grpc
 from grpc_status import rpc_status
 
 from vergence_proto import codec
-from vergence_proto.errors import DepthError, ErrorCode, ModelFailed
+from vergence_proto.errors import DepthError, ErrorCode
+from vergence_service.failures import error_of
 
 log = logging.getLogger(__name__)
 
@@ -50,7 +51,8 @@ async def abort(context: Context, error: DepthError) -> None:
     code = GRPC_STATUS[error.code]
     status = codec.error_to_status(error, code.value[0])
     trailing_metadata = rpc_status.to_status(status).trailing_metadata
-    await context.abort(code, str(error), trailing_metadata)
+    with suppress(grpc.aio.InternalError):  # the client is gone
+        await context.abort(code, str(error), trailing_metadata)
 
 
 @asynccontextmanager
@@ -58,10 +60,7 @@ async def errors_as_status(context: Context) -> AsyncIterator[None]:
     """End the call with the DepthError that the block raises; report other errors as INTERNAL."""
     try:
         yield
-    except DepthError as error:
-        await abort(context, error)
     except (grpc.aio.AbortError, grpc.aio.UsageError):
         raise
-    except Exception:
-        log.exception("a call failed with an unexpected error")
-        await abort(context, ModelFailed("the server failed; its log has the reason"))
+    except Exception as error:
+        await abort(context, error_of(error, log, "a call"))

@@ -1,8 +1,10 @@
 """vergence.v1.DepthService over grpc.aio, with the standard health and reflection services."""
 
+import asyncio
 import logging
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable
+from functools import partial
 from typing import Any, Self
 from urllib.parse import unquote
 
@@ -52,6 +54,19 @@ async def _requests(messages: AsyncIterator[bytes]) -> AsyncIterator[Request]:
         yield read_request(message)
 
 
+class _ClientGone(ClientLost):
+    """The client disconnected while it was sent an answer."""
+
+
+async def _write(context: Context, response: pb.StreamDepthResponse) -> None:
+    try:
+        await context.write(response)
+    except (grpc.aio.InternalError, grpc.aio.UsageError):
+        raise _ClientGone(
+            "the client disconnected while it was sent an answer", reads=False
+        ) from None
+
+
 _Answer = tuple[type[Message], Callable[[Any], Awaitable[Message]]]
 
 
@@ -83,10 +98,14 @@ class DepthServicer:
     async def _stream_depth(self, messages: AsyncIterator[bytes], context: Context) -> None:
         async with errors_as_status(context):
             peer = context.peer()
-            call = self.calls.make(_requests(messages), context.write, client=_host_of(peer))
+            write = partial(_write, context)
+            call = self.calls.make(_requests(messages), write, client=_host_of(peer))
             self._by_peer[peer] += 1
             try:
                 await self.calls.run(call)
+            except _ClientGone as gone:
+                log.info("a call over gRPC has ended: %s", gone)
+                raise asyncio.CancelledError from None  # gRPC takes it as the end of the call
             except ClientLost as lost:
                 log.info("a call over gRPC counts as lost: %s", lost)
                 await hang_up(context, str(lost), reads=lost.reads, shared=self._by_peer[peer] > 1)

@@ -12,7 +12,8 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 
-from vergence_proto.errors import BadShape, DepthError, ErrorCode, ModelFailed
+from vergence_proto.errors import BadShape, DepthError, ErrorCode
+from vergence_service.failures import error_of
 
 log = logging.getLogger(__name__)
 
@@ -108,8 +109,8 @@ def install_problems(app: FastAPI) -> None:
 
     @app.exception_handler(Exception)
     async def _unforeseen(request: Request, error: Exception) -> JSONResponse:
-        log.error("a request failed with an unexpected error", exc_info=error)
-        return _response(problem_of(ModelFailed("the server failed; its log has the reason")))
+        known = error_of(error, log, "a request")
+        return _response(problem_of(known), retry_after_s=known.retry_after_s)
 
 
 def _response(

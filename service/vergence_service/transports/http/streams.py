@@ -14,7 +14,7 @@ from google.protobuf.message import Message
 
 from vergence_proto import codec
 from vergence_proto.codec.requests import MAX_SMALL_BYTES
-from vergence_proto.errors import BadShape, DepthError, FrameTooLarge, ModelFailed, UnknownStream
+from vergence_proto.errors import BadShape, DepthError, FrameTooLarge, UnknownStream
 from vergence_proto.http_records import (
     CALL_ID_HEADER,
     PROTOBUF_TYPE,
@@ -23,6 +23,7 @@ from vergence_proto.http_records import (
     pack_record,
 )
 from vergence_proto.v1 import depth_pb2 as pb
+from vergence_service.failures import error_of
 from vergence_service.transports.http.bodies import body_of
 from vergence_service.transports.http.errors import PROBLEM_RESPONSE, log
 from vergence_service.transports.http.uploads import client_of
@@ -182,16 +183,13 @@ class _HttpCall:
         end: bytes | None = b""  # None: no end record; to the client, the answer breaks off
         try:
             await self._calls.run(self._call)
-        except DepthError as error:
-            end = self._end_record(error)
         except ClientLost as lost:
             log.info("a call over HTTP counts as lost: %s", lost)
             if not self._outgoing.empty():
                 self._outgoing.get_nowait()
             end = None
         except Exception as error:
-            log.error("a call failed with an unexpected error", exc_info=error)
-            end = self._end_record(ModelFailed("the server failed; its log has the reason"))
+            end = self._end_record(error_of(error, log, "a call"))
         # Not in a ``finally``: if the call was cancelled, no client is left to report to.
         await self._outgoing.put(None if end is None else pack_record(RecordKind.END, end))
         self._ended.set()
