@@ -47,8 +47,8 @@ async def main() -> None:
                     if each.frame.frame_id == 5:
                         for writer in writers:
                             writer.transport.abort()
-                    # A step that was not answered yet is sent again. ConnectionLost is raised if
-                    # the server took the frame, or cannot be reached for longer than its grace.
+                    # A step that the server has not taken is sent again. ConnectionLost is raised
+                    # if only its answer was lost.
                     result = await session.step(each.frame.left, each.frame.right, each.frame.pose)
                     print(f"frame {result.frame_id}: {result.origin.value}, {result.step_count}")
 

@@ -12,11 +12,12 @@ from typing import Any, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from vergence.attaching import OnLost
 from vergence.client import DepthClient
 from vergence.errors import NotOpen
 from vergence.info import ModelInfo, ServerInfo, StreamInfo
 from vergence.reprojection import DepthView, Fill, View
-from vergence.results import DepthResult, Drops, SessionEvent
+from vergence.results import DepthResult, Drops, NotSent, SessionEvent, SessionState
 from vergence.session import DepthSession, WorldFromLeft
 from vergence.transports.addresses import DEFAULT_SERVER
 from vergence.transports.forks import FORKED
@@ -146,6 +147,11 @@ class BlockingSession:
         self._loop.wait(self._session.__aexit__(*exc_info))
 
     @property
+    def state(self) -> SessionState:
+        """The state of the connection; silence shows after 1 s, or three round trips."""
+        return self._session.state
+
+    @property
     def latest(self) -> DepthResult | None:
         """The newest result so far; None before the first. Any thread may read it, at any time."""
         return self._session.latest
@@ -172,7 +178,7 @@ class BlockingSession:
         *,
         capture_ns: int | None = None,
         max_age_s: float | None = None,
-    ) -> int | None:
+    ) -> int | NotSent:
         """Send a live frame without waiting; its result comes by iteration.
 
         Parameters
@@ -188,9 +194,8 @@ class BlockingSession:
 
         Returns
         -------
-        int | None
-            The frame's id. None if the frame was dropped here (``drops.at_source``), because as
-            many frames as the credit allows are unanswered, or because the connection is down.
+        int | NotSent
+            The frame's id, from 1; or the reason why the frame was dropped here, which is false.
 
         Raises
         ------
@@ -203,7 +208,7 @@ class BlockingSession:
         NotOpen
             The session is not open, or has ended.
         DepthError
-            The error that ended the stream, such as Superseded, StreamExpired or ConnectionLost.
+            The error that ended the stream, such as Superseded.
         """
         return self._loop.call(
             lambda: self._session.submit(
@@ -239,11 +244,11 @@ class BlockingSession:
         ModelFailed, NonFinite
             The model failed on this frame; the stream continues.
         ConnectionLost
-            The connection broke after the server took the frame, or could not be restored.
+            The connection broke after the server took the frame.
         NotOpen
             The session is not open, or has ended.
         DepthError
-            The error that ended the stream, such as Superseded, StreamExpired or UnknownStream.
+            The error that ended the stream, such as Superseded.
         """
         return self._loop.wait(
             self._session.step(left, right, world_from_left, capture_ns=capture_ns)
@@ -373,6 +378,8 @@ class BlockingClient:
         stream_id: str | None = None,
         resume_token: bytes = b"",
         on_event: Callable[[SessionEvent], None] | None = None,
+        on_lost: OnLost = "restart",
+        open_timeout_s: float = 10.0,
     ) -> BlockingSession:
         """Make a session; its ``with`` opens the stream and ends it.
 
@@ -391,7 +398,7 @@ class BlockingClient:
             Refinement iterations of a warm step and of a cold start; 0: the server's defaults.
         weights_sha256
             The weights that results must come from (:attr:`ModelInfo.weights_sha256`); default:
-            those that the server runs, and the same ones after a reconnection.
+            any. Without them, a session goes on with a cold start if the server's change.
         encoding
             The format of images on the wire: RAW is exact and large, PNG is exact and slow.
         jpeg_quality
@@ -402,6 +409,13 @@ class BlockingClient:
             Take over the open stream of this ``stream_id``; its old session gets Superseded.
         on_event
             Called in the loop's thread with each :class:`SessionEvent`; it must not block.
+        on_lost
+            What to do when the server does not have the stream any more, because it was restarted
+            or has discarded the stream. ``"restart"``: go on with a new stream, whose first result
+            is a cold start. ``"raise"``: end the session with the error.
+        open_timeout_s
+            The time in seconds for which a server that cannot be reached, is not ready or has no
+            room is asked again.
 
         Raises
         ------
@@ -425,6 +439,8 @@ class BlockingClient:
             stream_id=stream_id,
             resume_token=resume_token,
             on_event=on_event,
+            on_lost=on_lost,
+            open_timeout_s=open_timeout_s,
         )
         return BlockingSession(session, self._loop)
 

@@ -4,6 +4,7 @@ import uuid
 from collections.abc import Callable
 from typing import Self
 
+from vergence.attaching import OnLost, RecoveryRules
 from vergence.errors import NotOpen
 from vergence.info import ServerInfo, StreamInfo
 from vergence.info_codec import server_info_from_proto, stream_info_from_proto
@@ -68,6 +69,8 @@ class DepthClient:
         stream_id: str | None = None,
         resume_token: bytes = b"",
         on_event: Callable[[SessionEvent], None] | None = None,
+        on_lost: OnLost = "restart",
+        open_timeout_s: float = 10.0,
     ) -> DepthSession:
         """Make a session; its ``async with`` opens the stream and ends it.
 
@@ -86,7 +89,7 @@ class DepthClient:
             Refinement iterations of a warm step and of a cold start; 0: the server's defaults.
         weights_sha256
             The weights that results must come from (:attr:`vergence.ModelInfo.weights_sha256`);
-            default: those that the server runs, and the same ones after a reconnection.
+            default: any. Without them, a session goes on with a cold start if the server's change.
         encoding
             The format of images on the wire: RAW is exact and large, PNG is exact and slow.
         jpeg_quality
@@ -97,6 +100,13 @@ class DepthClient:
             Take over the open stream of this ``stream_id``; its old session gets Superseded.
         on_event
             Called in the event loop with each :class:`SessionEvent`; it must not block.
+        on_lost
+            What to do when the server does not have the stream any more, because it was restarted
+            or has discarded the stream. ``"restart"``: go on with a new stream, whose first result
+            is a cold start. ``"raise"``: end the session with the error.
+        open_timeout_s
+            The time in seconds for which a server that cannot be reached, is not ready or has no
+            room is asked again.
 
         Raises
         ------
@@ -132,6 +142,7 @@ class DepthClient:
                 encoding=encoding,
                 jpeg_quality=jpeg_quality,
                 on_event=on_event,
+                rules=RecoveryRules(on_lost, open_timeout_s),
             )
         )
 

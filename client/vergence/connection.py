@@ -1,23 +1,29 @@
-"""The connection of one stream: opened, kept alive, and reopened when it breaks."""
+"""The connection of one stream: opened, watched, and replaced when it breaks or falls silent."""
 
 import asyncio
-import random
 import time
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
-from vergence.results import EventKind, SessionEvent
+from vergence.attaching import RecoveryRules, StreamAttacher
+from vergence.results import EventKind, SessionEvent, SessionState
+from vergence.silence import Silence
 from vergence.transports.base import Call, ConnectionLost, Transport
-from vergence_proto.errors import NotReady
+from vergence_proto.errors import (
+    DepthError,
+    Draining,
+    NotReady,
+    StreamExpired,
+    Superseded,
+    UnknownStream,
+)
 from vergence_proto.v1 import depth_pb2 as pb
 
 RESET = pb.StreamDepthRequest(reset=pb.Reset()).SerializeToString()
 _END = pb.StreamDepthRequest(end=pb.End()).SerializeToString()
 
-_OPEN_TIMEOUT_S = 5.0
 _CLOSE_TIMEOUT_S = 2.0
-_PING_INTERVAL_S = 1.0
-_FIRST_RETRY_S, _LAST_RETRY_S = 0.05, 1.0
+_LOOK_INTERVAL_S = 0.1
 
 _NOTICES = {
     pb.NOTICE_KIND_DRAINING: EventKind.DRAINING,
@@ -32,7 +38,7 @@ class StreamListener(Protocol):
         """The stream is open, or open again; returns what must be sent again."""
 
     def detached(self, lost: ConnectionLost) -> None:
-        """The connection broke; the stream may be open again later."""
+        """The connection is lost; the stream may be open again later."""
 
     def answered(self, response: pb.StreamDepthResponse) -> None:
         """A response about a frame arrived."""
@@ -40,9 +46,17 @@ class StreamListener(Protocol):
     def ended(self, error: Exception | None) -> None:
         """No response follows; ``error`` is None if the session asked for the end."""
 
+    @property
+    def awaited(self) -> bool:
+        """True while a call waits for the answer to its frame."""
+
 
 class StreamConnection:
-    """Attach to one stream, and resume it with its token for as long as the server keeps it."""
+    """Keeps one stream attached, until the end is requested or the stream cannot continue.
+
+    A connection that breaks is replaced. One that falls silent is reported, and replaced when
+    another one is up.
+    """
 
     def __init__(
         self,
@@ -50,38 +64,46 @@ class StreamConnection:
         opening: pb.OpenStream,
         listener: StreamListener,
         on_event: Callable[[SessionEvent], None] | None,
+        rules: RecoveryRules,
     ) -> None:
-        self._transport = transport
-        self._opening = opening
         self._listener = listener
         self._on_event = on_event
+        self._attacher = StreamAttacher(transport, opening, rules, self._report)
+        self._name = f"vergence stream {opening.stream_id}"
         self._outbox: asyncio.Queue[bytes] = asyncio.Queue()
+        self._silence = Silence()
         self._ending = False
-        self.up: bool = False  # True: a frame that is sent now leaves at once
-        self.round_trip_s: float | None = None
+        self.state: SessionState = SessionState.RECONNECTING
 
     @property
     def ending(self) -> bool:
         """Return True once the end was requested or has come."""
         return self._ending
 
+    @property
+    def round_trip_s(self) -> float | None:
+        """Return the network time of the latest ping, there and back; None before the first."""
+        return self._silence.round_trip_s
+
     async def open(self) -> None:
         """Attach, and reattach in the background until :meth:`close`."""
-        call = await self._attach()
-        name = f"vergence stream {self._opening.stream_id}"
-        self._runner = asyncio.create_task(self._run(call), name=name)
+        call = await self._attacher.open()
+        self._begin()
+        self._runner = asyncio.create_task(self._run(call), name=self._name)
 
     async def close(self) -> None:
-        """Wait for the last answers, at most two seconds, and close."""
+        """Wait for the last answers, at most two seconds if the server is there, and close."""
         self.end()
         try:
-            await asyncio.wait({self._runner}, timeout=_CLOSE_TIMEOUT_S)
+            if self.state is SessionState.LIVE:
+                await asyncio.wait({self._runner}, timeout=_CLOSE_TIMEOUT_S)
         finally:
             self._runner.cancel()
             await asyncio.gather(self._runner, return_exceptions=True)
 
     def send(self, request: bytes) -> None:
         """Queue a ``pb.StreamDepthRequest``, serialized."""
+        self._silence.active()
         self._outbox.put_nowait(request)
 
     def end(self) -> None:
@@ -90,28 +112,58 @@ class StreamConnection:
             self._ending = True
             self.send(_END)
 
-    async def _run(self, call: Call) -> None:
-        error: Exception | None = ConnectionLost("the session was closed")
+    async def _run(self, first: Call) -> None:
+        error: Exception | None = None
+        call: Call | None = first
         try:
-            while (lost := await self._converse(call)) is not None:
-                call = await self._resume(lost)
-            error = None
+            while call is not None:
+                call = await self._use(call)
         except Exception as fatal:  # whatever it is, every waiting step must raise it
             error = fatal
         finally:
             self._ending = True
+            self.state = SessionState.ENDED
             self._listener.ended(error)
 
-    async def _converse(self, call: Call) -> ConnectionLost | None:
-        """Send and receive until the call ends; None if the end was requested, else the failure."""
+    async def _use(self, call: Call) -> Call | None:
+        """Use a call for as long as it is good; return the next one, or None at the end."""
+        talk = asyncio.create_task(self._talk(call))
+        try:
+            beside = await self._replacement(talk)
+        finally:
+            talk.cancel()
+            await asyncio.gather(talk, return_exceptions=True)
+        lost = talk.result() if beside is None else ConnectionLost("the server fell silent")
+        if lost is None:
+            return None
+        if self._ending and not self._listener.awaited:
+            # Nothing is lost: the server drops the stream by itself.
+            if beside is not None:
+                await beside.close()
+            return None
+        return await self._reattach(lost, beside)
+
+    async def _talk(self, call: Call) -> DepthError | None:
+        """Send and receive until the call ends. Return why it was lost, None at the end.
+
+        Raises the error that ends the stream.
+        """
         helpers = [asyncio.create_task(self._send_all(call)), asyncio.create_task(self._ping())]
         try:
             while (response := await call.receive()) is not None:
                 self._take(response)
-        except ConnectionLost as lost:
+        except (NotReady, Draining, StreamExpired) as lost:
+            if self._attacher.must_raise(lost):
+                raise
+            if isinstance(lost, StreamExpired):
+                self._attacher.forget(lost)
+            return lost
+        except Superseded as lost:
+            if not self._attacher.unsure:
+                raise
+            self._attacher.unsure = False
             return lost
         finally:
-            self.up = False
             for helper in helpers:
                 helper.cancel()
             await asyncio.gather(*helpers, return_exceptions=True)
@@ -120,73 +172,106 @@ class StreamConnection:
 
     async def _send_all(self, call: Call) -> None:
         while True:
-            await call.send(await self._outbox.get())
+            request = await self._outbox.get()
+            self._silence.sent(request)
+            await call.send(request)
 
     async def _ping(self) -> None:
         while True:
             ping = pb.Ping(client_ns=time.monotonic_ns())
-            self.send(pb.StreamDepthRequest(ping=ping).SerializeToString())
-            await asyncio.sleep(_PING_INTERVAL_S)
+            self._silence.pinged(ping)
+            self._outbox.put_nowait(pb.StreamDepthRequest(ping=ping).SerializeToString())
+            await asyncio.sleep(self._silence.ping_interval_s)
 
-    async def _attach(self) -> Call:
-        call = await self._transport.open_call(self._opening.stream_id)
+    async def _replacement(self, talk: asyncio.Task[DepthError | None]) -> Call | None:
+        """Wait for the end of a call; return another call if this one is silent for too long."""
+        while True:
+            await self._while(lambda: not self._silence.too_long, talk)
+            if talk.done():
+                return None
+            self.state = SessionState.STALLED
+            silent_s = self._silence.silent_s
+            self._tell(EventKind.STALLED, f"no message from the server for {silent_s:.1f} s")
+            await self._while(lambda: self._silence.too_long and not self._silence.hopeless, talk)
+            if self._silence.too_long and (beside := await self._dialed_beside(talk)):
+                self._silence.replaced()
+                return beside
+            if talk.done():
+                return None
+            self.state = SessionState.LIVE
+            self._tell(EventKind.LIVE, "the server answers again")
+
+    async def _dialed_beside(self, talk: asyncio.Task[DepthError | None]) -> Call | None:
+        """Connect while another call is silent; None if that one is heard again, or ends."""
+        dialing = asyncio.create_task(self._attacher.dial())
         try:
-            async with asyncio.timeout(_OPEN_TIMEOUT_S):
-                await call.send(pb.StreamDepthRequest(open=self._opening).SerializeToString())
-                response = await call.receive()
-            if response is None or not response.HasField("opened"):
-                raise NotReady(f"expected the server to open the stream, got {response}")
-            self._opening.resume_token = response.opened.resume_token
-            self._opening.weights_sha256 = response.opened.model.weights_sha256
-            self._grace_s = response.opened.detach_grace_s
-            resend = self._listener.attached(response.opened)
-        except TimeoutError:
-            await call.close()
-            raise ConnectionLost(f"the server did not answer in {_OPEN_TIMEOUT_S:g} s") from None
-        except BaseException:
-            await call.close()
+            await self._while(lambda: self._silence.too_long, talk, dialing)
+            if self._silence.too_long and dialing.done() and not talk.done():
+                return dialing.result()
+        finally:
+            if not dialing.done():
+                dialing.cancel()
+                await asyncio.gather(dialing, return_exceptions=True)
+        if dialing.done() and not dialing.cancelled():
+            await dialing.result().close()
+        return None
+
+    async def _while(self, condition: Callable[[], bool], *tasks: asyncio.Task[Any]) -> None:
+        """Wait while the condition holds and no task is done."""
+        while condition() and not any(task.done() for task in tasks):
+            await asyncio.wait(tasks, timeout=_LOOK_INTERVAL_S, return_when=asyncio.FIRST_COMPLETED)
+
+    async def _reattach(self, lost: DepthError, beside: Call | None) -> Call | None:
+        started = time.monotonic()
+        if self.state is SessionState.LIVE:
+            self._tell(EventKind.DISCONNECTED, str(lost))
+        self.state = SessionState.RECONNECTING
+        self._listener.detached(
+            lost if isinstance(lost, ConnectionLost) else ConnectionLost(str(lost))
+        )
+        try:
+            call = await self._attacher.reopen(beside)
+        except (UnknownStream, StreamExpired):
+            if self._ending:  # the stream has ended as requested, and only the answer was lost
+                return None
             raise
-        # Requests queued for the broken connection are in `resend`, or too old to be sent.
+        away_s = time.monotonic() - started
+        gone, self._attacher.gone = self._attacher.gone, None
+        self._begin()
+        if gone is None:
+            self._tell(EventKind.RESUMED, f"resumed after {away_s:.2f} s")
+        else:
+            self._tell(
+                EventKind.RESTARTED,
+                f"restarted after {away_s:.2f} s; the stream's memory is lost: {gone}",
+            )
+        return call
+
+    def _begin(self) -> None:
+        """Start to use an attached call."""
+        assert self._attacher.opened is not None
+        # Requests queued for the last connection are sent again, or too old to be sent.
         self._outbox = asyncio.Queue()
-        for request in resend:
+        for request in self._listener.attached(self._attacher.opened):
             self.send(request)
         if self._ending:
             self.send(_END)
-        self.up = True
-        return call
-
-    async def _resume(self, lost: ConnectionLost) -> Call:
-        self._listener.detached(lost)
-        self._report(SessionEvent(EventKind.DISCONNECTED, str(lost)))
-        started, delay_s = time.monotonic(), _FIRST_RETRY_S
-        while True:
-            try:
-                call = await self._attach()
-            except NotReady as error:
-                if time.monotonic() + delay_s - started > self._grace_s:
-                    raise ConnectionLost(
-                        f"could not reach the server again in {self._grace_s:g} s, after which it "
-                        f"discards the stream; open a new session ({error})"
-                    ) from error
-            else:
-                away_s = time.monotonic() - started
-                self._report(SessionEvent(EventKind.RESUMED, f"resumed after {away_s:.2f} s"))
-                return call
-            # Half of the delay is random, so that clients do not all reconnect at once.
-            await asyncio.sleep(delay_s * random.uniform(0.5, 1.0))
-            delay_s = min(2 * delay_s, _LAST_RETRY_S)
+        self._silence.begin()
+        self.state = SessionState.LIVE
 
     def _take(self, response: pb.StreamDepthResponse) -> None:
+        self._silence.heard(response)
         match response.WhichOneof("message"):
             case "pong":
-                pong = response.pong
-                elapsed_ns = time.monotonic_ns() - pong.client_ns - pong.server_hold_ns
-                self.round_trip_s = elapsed_ns * 1e-9
+                pass
             case "notice" if response.notice.kind in _NOTICES:
                 notice = response.notice
-                self._report(SessionEvent(_NOTICES[notice.kind], notice.message, notice.in_s))
+                self._tell(_NOTICES[notice.kind], notice.message, notice.in_s)
             case _:
                 self._listener.answered(response)
+
+    def _tell(self, kind: EventKind, message: str, in_s: float = 0.0) -> None:
+        self._report(SessionEvent(kind, message, in_s))
 
     def _report(self, event: SessionEvent) -> None:
         if self._on_event is not None:

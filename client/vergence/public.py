@@ -6,7 +6,14 @@ from vergence.errors import NotOpen, WrongDelivery
 from vergence.filters import keep_confident, keep_range, without_speckles
 from vergence.info import ModelInfo, ServerInfo, StreamInfo
 from vergence.reprojection import DepthView, View, reproject
-from vergence.results import DepthResult, Drops, EventKind, SessionEvent
+from vergence.results import (
+    DepthResult,
+    Drops,
+    EventKind,
+    NotSent,
+    SessionEvent,
+    SessionState,
+)
 from vergence.session import DepthSession
 from vergence.transports.addresses import DEFAULT_SERVER
 from vergence.transports.base import ConnectionLost
@@ -89,6 +96,7 @@ __all__ = [
     "NonFinite",
     "NotOpen",
     "NotReady",
+    "NotSent",
     "Origin",
     "OutputFormat",
     "PlaneEncoding",
@@ -100,6 +108,7 @@ __all__ = [
     "SequenceNotDone",
     "ServerInfo",
     "SessionEvent",
+    "SessionState",
     "StateMemory",
     "StereoRig",
     "StreamExists",

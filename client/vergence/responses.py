@@ -36,6 +36,11 @@ class ResponseRouter:
         self._unread: deque[DepthResult | DepthError] = deque()
         self._arrived = asyncio.Event()
 
+    @property
+    def awaited(self) -> bool:
+        """True while a call waits for the answer to its frame."""
+        return any(frame.answer is not None for frame in self._in_flight.in_order())
+
     async def next(self) -> DepthResult:
         """Wait for the next live result; raises its error, or the one that ended the stream."""
         while not self._unread:

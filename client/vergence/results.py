@@ -1,7 +1,8 @@
 """Results of a session, the count of frames without a result, and events."""
 
 from dataclasses import dataclass, field
-from enum import StrEnum
+from enum import Enum, StrEnum
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,9 @@ class Drops:
     """
 
     at_source: int = 0
-    """Not sent: as many frames as the credit allows were unanswered, or the connection was down."""
+    """Not sent: as many frames as the credit allows were unanswered."""
+    offline: int = 0
+    """Not sent: the connection was down, or silent."""
     displaced: int = 0
     """Displaced by a newer frame in the server, or on a full network."""
     stale: int = 0
@@ -32,7 +35,7 @@ class Drops:
     @property
     def total(self) -> int:
         """The sum of all drops."""
-        return self.at_source + self.displaced + self.stale + self.unread + self.lost
+        return self.at_source + self.offline + self.displaced + self.stale + self.unread + self.lost
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,13 +91,47 @@ class DepthResult(DisparityMap):
         return points
 
 
+class NotSent(Enum):
+    """The reason why :meth:`vergence.DepthSession.submit` did not send a frame. It is false."""
+
+    CREDIT = "credit"
+    """As many frames as the credit allows are unanswered (``drops.at_source``)."""
+    OFFLINE = "offline"
+    """The connection is down or silent; see :attr:`vergence.DepthSession.state`."""
+
+    def __bool__(self) -> Literal[False]:
+        """Return False: no frame was sent, and so there is no frame id."""
+        return False
+
+
+class SessionState(StrEnum):
+    """The state of a session's connection."""
+
+    LIVE = "live"
+    """The server answers."""
+    STALLED = "stalled"
+    """The server has been silent for 1 s, or three round trips; the connection may recover."""
+    RECONNECTING = "reconnecting"
+    """The connection is lost, and the session is making another one."""
+    ENDED = "ended"
+    """The session has ended."""
+
+
 class EventKind(StrEnum):
     """The kind of a :class:`SessionEvent`."""
 
+    STALLED = "stalled"
+    """The server is silent; the session waits, and tries another connection."""
+    LIVE = "live"
+    """The server answers again on the same connection; nothing was lost."""
     DISCONNECTED = "disconnected"
     """The connection broke; the session is trying to resume."""
     RESUMED = "resumed"
-    """The connection is back, and the stream's state was kept."""
+    """Another connection is up, and the stream's state was kept."""
+    RESTARTED = "restarted"
+    """Another connection is up, and the stream's state is lost: the next frame is a cold start."""
+    WAITING = "waiting"
+    """The server has no room for the stream now; the session tries again."""
     DRAINING = "draining"
     """The server is shutting down."""
     EXPIRING = "expiring"
@@ -110,4 +147,4 @@ class SessionEvent:
     message: str
     """A sentence for a log."""
     in_s: float = 0.0
-    """Seconds until it happens; 0: it has happened."""
+    """Seconds until it happens, or until the next attempt; 0: it has happened."""

@@ -9,6 +9,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from vergence.attaching import RecoveryRules
 from vergence.capture_clock import CaptureClock
 from vergence.connection import RESET, StreamConnection
 from vergence.errors import NotOpen, WrongDelivery
@@ -17,7 +18,7 @@ from vergence.info import ModelInfo
 from vergence.info_codec import model_info_from_proto
 from vergence.reprojection import DepthView, Fill, View
 from vergence.responses import ResponseRouter
-from vergence.results import DepthResult, Drops, SessionEvent
+from vergence.results import DepthResult, Drops, NotSent, SessionEvent, SessionState
 from vergence.transports.base import Transport
 from vergence_proto import codec
 from vergence_proto.geometry import Matrix, Pose, RectifiedRig
@@ -37,6 +38,7 @@ class SessionSetup:
     encoding: ImageEncoding
     jpeg_quality: int
     on_event: Callable[[SessionEvent], None] | None
+    rules: RecoveryRules
 
 
 class DepthSession:
@@ -61,8 +63,10 @@ class DepthSession:
     Call the methods in the thread of the event loop. A camera with callbacks in another thread
     uses ``loop.call_soon_threadsafe(session.submit, left, right, world_from_left)``.
 
-    If the connection breaks, the session reconnects and resumes the stream, for as long as the
-    server keeps its state. ``on_event`` reports it, and the next result's origin is RESUMED.
+    If the connection breaks or falls silent, the session makes another one and resumes the stream:
+    the next result's origin is RESUMED. If the server does not have the stream any more, the
+    session goes on with a new one, whose first result is a cold start. Frame ids go on in both
+    cases, ``on_event`` reports them, and :attr:`state` shows the connection.
 
     Every method but ``__aenter__`` raises :class:`NotOpen` before ``async with``. A session that is
     forgotten while it is open gives a ResourceWarning, as an open file does; its stream stays open
@@ -76,7 +80,7 @@ class DepthSession:
         self._in_flight = FramesInFlight()
         self._responses = ResponseRouter(self._in_flight, codec.axes_from_proto(setup.opening.axes))
         self._connection = StreamConnection(
-            setup.transport, setup.opening, self._responses, setup.on_event
+            setup.transport, setup.opening, self._responses, setup.on_event, setup.rules
         )
         self._clock = CaptureClock(live=setup.delivery is Delivery.NEWEST)
         self._turn = asyncio.Lock()
@@ -84,6 +88,9 @@ class DepthSession:
 
     async def __aenter__(self) -> Self:
         """Open the stream, or take it over with the resume token.
+
+        A server that cannot be reached, is not ready or has no room is asked again, for at most
+        ``open_timeout_s``; then the latest error is raised.
 
         Raises
         ------
@@ -104,7 +111,7 @@ class DepthSession:
         Draining, NotReady
             The server is shutting down, or is not ready yet.
         ConnectionLost
-            The server cannot be reached, or did not answer in 5 s.
+            The server cannot be reached, or does not answer.
         NotOpen
             The session was open before; a session opens once.
         """
@@ -168,6 +175,12 @@ class DepthSession:
         return self._connection.round_trip_s
 
     @property
+    def state(self) -> SessionState:
+        """The state of the connection; silence shows after 1 s, or three round trips."""
+        self._opened()
+        return self._connection.state
+
+    @property
     def latest(self) -> DepthResult | None:
         """The newest result so far; None before the first. Any thread may read it, at any time."""
         return self._responses.recent.latest
@@ -225,7 +238,7 @@ class DepthSession:
         *,
         capture_ns: int | None = None,
         max_age_s: float | None = None,
-    ) -> int | None:
+    ) -> int | NotSent:
         """Send a live frame without waiting; its result comes by iteration.
 
         Parameters
@@ -242,9 +255,8 @@ class DepthSession:
 
         Returns
         -------
-        int | None
-            The frame's id. None if the frame was dropped here (``drops.at_source``), because as
-            many frames as the credit allows are unanswered, or because the connection is down.
+        int | NotSent
+            The frame's id, from 1; or the reason why the frame was dropped here, which is false.
 
         Raises
         ------
@@ -259,15 +271,18 @@ class DepthSession:
         NotOpen
             The session is not open, or has ended.
         DepthError
-            The error that ended the stream, such as Superseded, StreamExpired or ConnectionLost.
+            The error that ended the stream, such as Superseded.
         """
         self._opened()
         if self._setup.delivery is Delivery.EVERY:
             raise WrongDelivery("submit() may drop frames and this session is lossless: use step()")
         self._check_open()
-        if not (self._connection.up and self._in_flight.has_room):
+        if self._connection.state is not SessionState.LIVE:
+            self._in_flight.count(offline=1)
+            return NotSent.OFFLINE
+        if not self._in_flight.has_room:
             self._in_flight.count(at_source=1)
-            return None
+            return NotSent.CREDIT
         request = self._request(left, right, world_from_left, capture_ns, max_age_s)
         return self._send(request, answer=None)
 
@@ -299,11 +314,11 @@ class DepthSession:
         ModelFailed, NonFinite
             The model failed on this frame; the stream continues.
         ConnectionLost
-            The connection broke after the server took the frame, or could not be restored.
+            The connection broke after the server took the frame.
         NotOpen
             The session is not open, or has ended.
         DepthError
-            The error that ended the stream, such as Superseded, StreamExpired or UnknownStream.
+            The error that ended the stream, such as Superseded.
         """
         self._opened()
         answer: asyncio.Future[DepthResult] = asyncio.get_running_loop().create_future()
@@ -352,8 +367,13 @@ class DepthSession:
         ------
         ModelFailed, NonFinite, BadShape, FrameTooLarge
             A submitted frame failed. The stream continues: iterate again.
-        Superseded, StreamExpired, UnknownStream, ModelChanged, ConnectionLost
-            The stream ended.
+        Superseded, UnknownStream
+            Another session has taken the stream over, or closed it.
+        StreamExpired, UnknownStream, ModelChanged, Draining, ConnectionLost
+            The server does not have the stream any more, and ``on_lost`` is ``"raise"``. With
+            ``"restart"``, ModelChanged is raised if ``weights_sha256`` was given.
+        Quota, StreamLimit, StateMemory
+            The server has had no room for the stream for ``open_timeout_s``.
         NotOpen
             The session was never open.
         """

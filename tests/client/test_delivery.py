@@ -15,6 +15,7 @@ from vergence import (
     DepthSession,
     FrameStale,
     ModelFailed,
+    NotSent,
     WrongDelivery,
 )
 
@@ -40,7 +41,8 @@ async def test_frames_beyond_the_credit_are_dropped_at_the_source_and_counted(
         assert session.credit == 2
         with model.busy():
             taken = [submit(session, frame_id) for frame_id in range(1, 11)]
-            assert taken == [1, 2] + [None] * 8
+            assert taken == [1, 2] + [NotSent.CREDIT] * 8
+            assert not any(taken[2:])
             assert session.drops.at_source == 8
         first, second = [await anext(session) for _ in range(2)]
         assert (first.frame_id, second.frame_id) == (1, 2)

@@ -30,7 +30,7 @@ async def test_waiting_in_vain_for_a_place_says_how_long_to_wait() -> None:
         client.open_session(RIG),
     ):
         with pytest.raises(StreamLimit) as refused:
-            async with client.open_session(RIG):
+            async with client.open_session(RIG, open_timeout_s=0.1):
                 pass
         assert refused.value.retry_after_s is not None
         assert refused.value.retry_after_s > 0
@@ -87,7 +87,7 @@ async def test_an_idle_stream_expires_after_a_notice() -> None:
     async with (
         running_server(RecallModel(), clock=clock) as server,
         DepthClient(server.grpc_address) as client,
-        client.open_session(RIG, on_event=events.append) as session,
+        client.open_session(RIG, on_event=events.append, on_lost="raise") as session,
     ):
         clock.advance(55)
         await eventually(lambda: events)
@@ -111,7 +111,7 @@ async def test_an_end_that_meets_what_the_client_sends_is_told_as_what_it_is() -
         DepthClient(server.grpc_address) as client,
     ):
         for _ in range(10):  # the two meet in about every second
-            async with client.open_session(RIG, on_event=events.append) as session:
+            async with client.open_session(RIG, on_event=events.append, on_lost="raise") as session:
                 sending = asyncio.create_task(send_without_pause(session))
                 await step(session, 1)
                 clock.advance(60)

@@ -49,15 +49,3 @@ def test_a_pong_tells_lost_from_late_among_the_frames_before_its_ping(
 
 def test_a_pong_to_no_ping_of_ours_proves_nothing(unanswered: Unanswered) -> None:
     assert unanswered.answered(a_pong(7)) == []
-
-
-def test_silence_counts_from_the_oldest_ping_that_no_later_pong_has_overtaken(
-    unanswered: Unanswered,
-) -> None:
-    assert unanswered.silent_s(100 + 10**9) == 1.0
-    unanswered.pinged(200)
-    unanswered.pinged(300)
-    unanswered.answered(a_pong(200, 1, 2, 3))
-    assert unanswered.silent_s(300 + 10**9) == 1.0
-    unanswered.answered(a_pong(300, 1, 2, 3))
-    assert unanswered.silent_s(10**12) == 0.0

@@ -142,7 +142,7 @@ async def test_a_draining_server_says_so_and_ends_the_call() -> None:
     async with (
         running_server(RecallModel()) as server,
         http_client(server) as client,
-        client.open_session(RIG, on_event=events.append) as session,
+        client.open_session(RIG, on_event=events.append, on_lost="raise") as session,
     ):
         await step(session, FRAMES[0])
         await drain(server, within_s=0.1)

@@ -125,7 +125,7 @@ async def test_streams_go_to_the_server_with_the_most_room_and_stay_there() -> N
         with pytest.raises(StreamExists):
             await client.open_session(RIG, stream_id="a").__aenter__()
         with pytest.raises(StreamLimit):
-            await client.open_session(RIG, stream_id="c").__aenter__()
+            await client.open_session(RIG, stream_id="c", open_timeout_s=0.1).__aenter__()
         await client.close_stream("b")
         with pytest.raises(UnknownStream):
             await step(b, 2)

@@ -43,6 +43,22 @@ async def test_a_resumed_stream_goes_on_from_the_state_it_had() -> None:
     assert answer.disparity.data == await reference_map()
 
 
+async def test_an_opening_whose_answer_was_lost_may_be_repeated_by_its_sender_only() -> None:
+    async with (
+        running_server(RecallModel()) as server,
+        raw_stream(server, "mine", opening_id=b"secret") as lost,
+    ):
+        async with raw_stream(server, "mine", opening_id=b"secret") as call:
+            assert call.opened.resume_token == lost.opened.resume_token
+            assert not call.opened.resumed
+            answer = (await call.ask(frame_message(make_frame(1)))).disparity
+        assert (answer.origin, answer.step_count) == (pb.ORIGIN_COLD_START, 1)
+        for guess in (b"", b"guess"):
+            with pytest.raises(grpc.aio.AioRpcError, match="is open; resume it"):
+                async with raw_stream(server, "mine", opening_id=guess):
+                    pass
+
+
 async def test_a_frame_that_was_in_the_model_when_the_client_was_lost_can_be_sent_again() -> None:
     model = RecallModel()
     async with running_server(model) as server:

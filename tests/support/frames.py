@@ -42,11 +42,13 @@ def open_message(
     every: bool = True,
     axes: pb.Axes = pb.AXES_OPENCV,
     sigma: bool = False,
+    opening_id: bytes = b"",
 ) -> pb.StreamDepthRequest:
     return pb.StreamDepthRequest(
         open=pb.OpenStream(
             stream_id=stream_id,
             resume_token=resume_token,
+            opening_id=opening_id,
             rig=codec.rig_to_proto(rig or StereoRig.from_rectified(RIG)),
             axes=axes,
             delivery=pb.DELIVERY_EVERY if every else pb.DELIVERY_NEWEST,

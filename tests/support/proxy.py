@@ -1,4 +1,4 @@
-"""A TCP proxy between client and server whose wire can be cut."""
+"""A TCP proxy between client and server: its wire can be cut, go silent, or be long."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -6,15 +6,20 @@ from contextlib import asynccontextmanager, suppress
 
 
 class Proxy:
-    """Forwards bytes both ways to one address until it is cut."""
+    """Forwards bytes both ways to one address until it is cut.
 
-    def __init__(self, target: str) -> None:
+    ``delay_s`` is the time of a byte from one end to the other; a new connection takes a round trip
+    before its first byte, as TCP's handshake does.
+    """
+
+    def __init__(self, target: str, *, delay_s: float = 0.0) -> None:
         self._target = target
+        self._delay_s = delay_s
         self._connections: set[asyncio.Task[None]] = set()
         self._writers: set[asyncio.StreamWriter] = set()
         self._whole = True
-        self._upward = asyncio.Event()
-        self._upward.set()
+        self._upward = _open_gate()
+        self._wire = _open_gate()
         self.address = ""
         self.accepted = 0
 
@@ -25,8 +30,10 @@ class Proxy:
             writer.transport.abort()
 
     def mend(self) -> None:
+        """Let everything through again, held bytes first."""
         self._whole = True
         self._upward.set()
+        self._wire.set()
 
     def lead_to(self, target: str) -> None:
         """Break every connection; new ones go to another address."""
@@ -38,39 +45,71 @@ class Proxy:
         """What the client sends from now on does not arrive, until :meth:`mend`."""
         self._upward.clear()
 
+    def fall_silent(self) -> None:
+        """Nothing passes, either way or on new connections, until :meth:`mend`."""
+        self._wire.clear()
+
+    def forget_connections(self) -> None:
+        """Nothing passes on the connections of now, for ever; new ones work.
+
+        So it is when the client's address has changed.
+        """
+        self._wire.clear()
+        self._wire = _open_gate()
+
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
         assert task is not None
         self._connections.add(task)
+        writers = [writer]
         try:
             if not self._whole:
-                writer.transport.abort()
                 return
             self.accepted += 1
+            upward, wire = self._upward, self._wire
+            await asyncio.sleep(2 * self._delay_s)
             host, _, port = self._target.rpartition(":")
             server_reader, server_writer = await asyncio.open_connection(host, int(port))
-            self._writers |= {writer, server_writer}
-            with suppress(OSError):
-                async with asyncio.TaskGroup() as tasks:
-                    tasks.create_task(self._pump(reader, server_writer, self._upward))
-                    tasks.create_task(self._pump(server_reader, writer, None))
+            writers.append(server_writer)
+            self._writers.update(writers)
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(self._pump(reader, server_writer, upward, wire))
+                tasks.create_task(self._pump(server_reader, writer, wire))
+        except (OSError, asyncio.CancelledError):
+            pass  # the target is gone, or close() was called
         finally:
             self._connections.discard(task)
+            self._writers.difference_update(writers)
+            for each in writers:
+                each.transport.abort()
 
     async def _pump(
-        self,
-        reader: asyncio.StreamReader,
-        writer: asyncio.StreamWriter,
-        gate: asyncio.Event | None,
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, *gates: asyncio.Event
     ) -> None:
-        with suppress(OSError):
-            while data := await reader.read(1 << 16):
-                if gate is not None:
+        travelling: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue()
+        loop = asyncio.get_running_loop()
+
+        async def arrive() -> None:
+            while True:
+                due_s, data = await travelling.get()
+                await asyncio.sleep(due_s - loop.time())
+                for gate in gates:
                     await gate.wait()
+                if not data:
+                    return
                 writer.write(data)
                 await writer.drain()
-        self._writers.discard(writer)
-        writer.transport.abort()
+
+        arriving = asyncio.create_task(arrive())
+        try:
+            with suppress(OSError):
+                while data := await reader.read(1 << 16):
+                    travelling.put_nowait((loop.time() + self._delay_s, data))
+                travelling.put_nowait((loop.time() + self._delay_s, b""))
+                await arriving
+        finally:
+            arriving.cancel()
+            writer.transport.abort()
 
     async def close(self) -> None:
         self.cut()
@@ -79,9 +118,15 @@ class Proxy:
         await asyncio.gather(*self._connections, return_exceptions=True)
 
 
+def _open_gate() -> asyncio.Event:
+    gate = asyncio.Event()
+    gate.set()
+    return gate
+
+
 @asynccontextmanager
-async def proxy_to(target: str) -> AsyncIterator[Proxy]:
-    proxy = Proxy(target)
+async def proxy_to(target: str, *, delay_s: float = 0.0) -> AsyncIterator[Proxy]:
+    proxy = Proxy(target, delay_s=delay_s)
     server = await asyncio.start_server(proxy.serve, "127.0.0.1", 0)
     proxy.address = f"127.0.0.1:{server.sockets[0].getsockname()[1]}"
     try:

@@ -1,7 +1,7 @@
 """Frames as a camera would hand them to a session, by their numbers."""
 
 from tests.support.frames import make_frame
-from vergence import DepthResult, DepthSession, OutputFormat, PlaneEncoding
+from vergence import DepthResult, DepthSession, NotSent, OutputFormat, PlaneEncoding
 
 EXACT = OutputFormat(encoding=PlaneEncoding.FLOAT32)
 
@@ -11,6 +11,6 @@ async def step(session: DepthSession, frame_id: int, brightness: int = 64) -> De
     return await session.step(frame.left, frame.right, frame.pose, capture_ns=frame.capture_ns)
 
 
-def submit(session: DepthSession, frame_id: int, brightness: int = 64) -> int | None:
+def submit(session: DepthSession, frame_id: int, brightness: int = 64) -> int | NotSent:
     frame = make_frame(frame_id, brightness=brightness)
     return session.submit(frame.left, frame.right, frame.pose, capture_ns=frame.capture_ns)

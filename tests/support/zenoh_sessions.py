@@ -8,7 +8,7 @@ from tests.support.frames import make_frame
 from tests.support.models import RecallModel
 from tests.support.server import running_server
 from tests.support.zenoh_net import address_of, free_endpoint
-from vergence import Delivery, DepthResult, DepthSession
+from vergence import Delivery, DepthResult, DepthSession, NotSent
 from vergence_service.app.server import Running
 
 LOSSLESS = Delivery.EVERY
@@ -19,7 +19,7 @@ async def step(session: DepthSession, frame_id: int) -> DepthResult:
     return await session.step(frame.left, frame.right, frame.pose, capture_ns=frame.capture_ns)
 
 
-def submit(session: DepthSession, frame_id: int) -> int | None:
+def submit(session: DepthSession, frame_id: int) -> int | NotSent:
     frame = make_frame(frame_id)
     return session.submit(frame.left, frame.right, frame.pose)
 

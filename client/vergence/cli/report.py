@@ -103,6 +103,7 @@ def _by_place(drops: Drops) -> str:
     """Name the places where frames were dropped, with their counts."""
     places = {
         "at the source": drops.at_source,
+        "without a connection": drops.offline,
         "displaced in the server": drops.displaced,
         "too old": drops.stale,
         "unread": drops.unread,

@@ -3,8 +3,8 @@
 import asyncio
 import signal
 import time
-from collections.abc import AsyncGenerator, Iterator, Sequence
-from contextlib import aclosing, contextmanager, nullcontext, suppress
+from collections.abc import AsyncGenerator, AsyncIterator, Iterator, Sequence
+from contextlib import aclosing, asynccontextmanager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -69,16 +69,16 @@ async def run(
             server, console, pixels=footage.rig.left.width * footage.rig.left.height
         ) as address,
         DepthClient(address) as client,
-        client.open_session(
-            footage.rig,
-            delivery=pace.delivery,
-            output=OutputFormat(
+        _session(
+            client,
+            footage,
+            pace,
+            OutputFormat(
                 confidence=Output.CONFIDENCE in outputs or files.kept.min_confidence > 0,
                 sigma=Output.SIGMA in outputs or drawn,
                 compressed=not on_this_machine(address),
             ),
-            iterations=iterations,
-            cold_iterations=iterations if footage.alone else 0,
+            iterations,
         ) as session,
     ):
         title = title_of(footage.name, footage.rig, session.model.name)
@@ -151,6 +151,23 @@ class _Pace:
 
     delivery: Delivery
     rate_hz: float | None = None  # None: as fast as they come, or as the server steps them
+
+
+@asynccontextmanager
+async def _session(
+    client: DepthClient, footage: Footage, pace: _Pace, output: OutputFormat, iterations: int
+) -> AsyncIterator[DepthSession]:
+    await client.server_info()  # fails at once if no server is there; a session would wait for it
+    async with client.open_session(
+        footage.rig,
+        delivery=pace.delivery,
+        output=output,
+        iterations=iterations,
+        cold_iterations=iterations if footage.alone else 0,
+        # Without a frame left out, a cold start would change what is written.
+        on_lost="raise" if pace.delivery is Delivery.EVERY else "restart",
+    ) as session:
+        yield session
 
 
 def _pace(rate: str, footage: Footage) -> _Pace:

@@ -70,7 +70,7 @@ async def live_frames(
                 frame = source.frame
                 at_ns = frame.capture_ns if rate_hz is None else None  # None: now
                 frame_id = session.submit(frame.left, frame.right, frame.pose, capture_ns=at_ns)
-                if frame_id is not None:
+                if frame_id:
                     sent[frame_id] = index, source
         finally:
             session.end()  # the reader below ends after the last answer

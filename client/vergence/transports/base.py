@@ -13,8 +13,8 @@ Answer = TypeVar("Answer", bound=Message)
 class ConnectionLost(NotReady):
     """The server cannot be reached, or the connection to it broke.
 
-    A session reconnects by itself first. Raised from a session it is final for the frame, or, if
-    the message says so, for the session.
+    A session reconnects by itself. Raised from a session it is final for the frame, or, if the
+    message says so, for the session.
     """
 
 
@@ -41,7 +41,11 @@ class Transport(Protocol):
     """One connection to a server, or to the servers of one Zenoh namespace."""
 
     async def open_call(self, stream_id: str) -> Call:
-        """Start a StreamDepth call; every frame of ``stream_id`` must reach the same server."""
+        """Connect, and start a StreamDepth call on a connection of its own.
+
+        Every frame of ``stream_id`` must reach the same server. Raises ConnectionLost; may wait for
+        as long as the network is silent.
+        """
 
     async def ask(self, method: str, request: Message, answer: type[Answer]) -> Answer:
         """Call a unary method of DepthService by its name."""

@@ -1,7 +1,8 @@
-"""The gRPC transport: one HTTP/2 connection per client."""
+"""The gRPC transport: one HTTP/2 connection per stream, and one for unary methods."""
 
 import asyncio
 import contextlib
+from collections.abc import Callable
 from typing import cast
 
 import grpc
@@ -29,12 +30,13 @@ _CHANNEL_OPTIONS = (
     # Without these, a server that vanished silently would be noticed after two hours.
     ("grpc.keepalive_time_ms", 10_000),
     ("grpc.keepalive_timeout_ms", 5_000),
-    # gRPC itself waits 1 s to 2 min between attempts and fails every call made meanwhile; the
-    # session has a backoff of its own, and only the server's grace to come back in.
+    # gRPC itself waits 1 s to 2 min between attempts and fails every call made meanwhile.
     ("grpc.initial_reconnect_backoff_ms", 100),
-    ("grpc.min_reconnect_backoff_ms", 100),
     ("grpc.max_reconnect_backoff_ms", 500),
-    # Otherwise two clients in one process share one connection and its backoff.
+    # Despite its name this is the time in which an attempt must connect, two round trips. Callers
+    # have shorter timeouts of their own.
+    ("grpc.min_reconnect_backoff_ms", 20_000),
+    # Otherwise the channels of one process share one connection and its backoff.
     ("grpc.use_local_subchannel_pool", 1),
 )
 
@@ -49,18 +51,32 @@ class GrpcTransport:
     def __init__(self, address: str, *, direct: bool = False) -> None:
         use_grpc()
         self._address = address
-        options = (*_CHANNEL_OPTIONS, ("grpc.enable_http_proxy", int(not direct)))
-        self._channel = grpc.aio.insecure_channel(address, options=options)
+        self._options = (*_CHANNEL_OPTIONS, ("grpc.enable_http_proxy", int(not direct)))
         self._through = "" if direct else through_proxy(f"grpc://{address}")
+        self._channel = self._connection()
+        self._calls: set[_GrpcCall] = set()
 
     async def open_call(self, stream_id: str) -> Call:
-        start = self._channel.stream_stream(
+        # A channel of its own, because a new one can connect while TCP still waits for the old.
+        channel = self._connection()
+        start = channel.stream_stream(
             f"{_SERVICE}StreamDepth",
             request_serializer=bytes,  # requests are serialized already
             response_deserializer=pb.StreamDepthResponse.FromString,
         )
-        call = start(request_iterator=None, metadata=((STREAM_ID_METADATA, stream_id),))
-        return _GrpcCall(call, self._address, self._through)
+        started = start(request_iterator=None, metadata=((STREAM_ID_METADATA, stream_id),))
+        call = _GrpcCall(channel, started, self._address, self._through)
+        try:
+            await call.connected()
+        except BaseException:
+            await call.close()
+            raise
+        self._calls.add(call)
+        call.closed = self._calls.discard
+        return call
+
+    def _connection(self) -> grpc.aio.Channel:
+        return grpc.aio.insecure_channel(self._address, options=self._options)
 
     async def ask(self, method: str, request: Message, answer: type[Answer]) -> Answer:
         invoke = self._channel.unary_unary(
@@ -76,15 +92,20 @@ class GrpcTransport:
 
     async def close(self) -> None:
         await self._channel.close(grace=None)
+        for call in list(self._calls):
+            await call.close()
 
 
 class _GrpcCall:
     def __init__(
         self,
+        channel: grpc.aio.Channel,
         call: "grpc.aio.StreamStreamCall[bytes, pb.StreamDepthResponse]",
         address: str,
         through: str,
     ) -> None:
+        self.closed: Callable[[_GrpcCall], None] = _nothing
+        self._channel = channel
         self._call = call
         self._responses = aiter(call)
         self._address = address
@@ -92,6 +113,12 @@ class _GrpcCall:
         self._status: asyncio.Future[grpc.aio.AioRpcError]
         self._status = asyncio.get_running_loop().create_future()
         call.add_done_callback(self._keep_status)
+
+    async def connected(self) -> None:
+        try:
+            await self._call.wait_for_connection()
+        except grpc.aio.AioRpcError as error:
+            raise _error_from_rpc(error, self._address, self._through) from None
 
     async def send(self, request: bytes) -> None:
         # Both errors mean that the call has ended, before this write or during it.
@@ -105,6 +132,8 @@ class _GrpcCall:
             return await anext(self._responses, None)
         except grpc.aio.AioRpcError as error:
             why = await self._why_ended(error)
+            if why.code() is grpc.StatusCode.OK:  # it ended during a write
+                return None
             raise _error_from_rpc(why, self._address, self._through) from None
         except asyncio.CancelledError:
             # gRPC raises it also if the channel was closed and nobody cancelled this task.
@@ -115,6 +144,8 @@ class _GrpcCall:
 
     async def close(self) -> None:
         self._call.cancel()
+        self.closed(self)
+        await self._channel.close(grace=None)
 
     async def _why_ended(self, error: grpc.aio.AioRpcError) -> grpc.aio.AioRpcError:
         try:
@@ -131,6 +162,10 @@ class _GrpcCall:
         status = _status_of(self._call)
         if status.details() != _WRITE_FAILED and not self._status.done():
             self._status.set_result(status)
+
+
+def _nothing(call: _GrpcCall) -> None:
+    """Do nothing: the call is in no list yet."""
 
 
 def _status_of(

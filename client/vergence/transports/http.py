@@ -1,7 +1,7 @@
 """The HTTP transport, for restricted networks: see :mod:`vergence_proto.http_records`."""
 
 from collections import deque
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 import httpx
@@ -41,13 +41,26 @@ class HttpTransport:
     """The :class:`~vergence.transports.base.Transport` to ``http://HOST:PORT`` (or https)."""
 
     def __init__(self, base_url: str) -> None:
-        # Every call has two connections, and the number of sessions is not limited here.
-        limits = httpx.Limits(max_connections=None, max_keepalive_connections=None)
-        self._http = http_client(base_url, limits=limits, timeout=_TIMEOUT_S)
+        self._base_url = base_url
+        self._tls = httpx.create_ssl_context()  # one for all connections: it takes 20 ms to make
+        self._http = self._connections()
+        self._calls: set[_HttpCall] = set()
 
     async def open_call(self, stream_id: str) -> Call:
         self._check_open()
-        return _HttpCall(self._http, stream_id)
+        # Connections of its own, because those of another call may be dead without knowing it.
+        call = _HttpCall(self._connections(), stream_id)
+        try:
+            await call.connect()
+        except BaseException:
+            await call.close()
+            raise
+        self._calls.add(call)
+        call.closed = self._calls.discard
+        return call
+
+    def _connections(self) -> httpx.AsyncClient:
+        return http_client(self._base_url, timeout=_TIMEOUT_S, verify=self._tls)
 
     async def ask(self, method: str, request: Message, answer: type[Answer]) -> Answer:
         self._check_open()
@@ -64,6 +77,8 @@ class HttpTransport:
 
     async def close(self) -> None:
         await self._http.aclose()
+        for call in list(self._calls):
+            await call.close()
 
     def _check_open(self) -> None:
         if self._http.is_closed:
@@ -72,6 +87,7 @@ class HttpTransport:
 
 class _HttpCall:
     def __init__(self, http: httpx.AsyncClient, stream_id: str) -> None:
+        self.closed: Callable[[_HttpCall], None] = _nothing
         self._http = http
         self._headers = {**_HEADERS, STREAM_ID_METADATA: stream_id}
         self._answer: httpx.Response | None = None
@@ -79,6 +95,13 @@ class _HttpCall:
         self._reader = RecordReader()
         self._records: deque[tuple[RecordKind, bytes]] = deque()
         self._error: DepthError | None = None  # for receive to raise
+
+    async def connect(self) -> None:
+        """Connect; the answer does not matter, and the call uses the same connection."""
+        try:
+            await self._http.options("/v1/streams")
+        except httpx.TransportError as error:
+            raise _lost(self._http, error) from None
 
     async def send(self, request: bytes) -> None:
         try:
@@ -113,8 +136,11 @@ class _HttpCall:
         return None
 
     async def close(self) -> None:
+        self._error = self._error or ConnectionLost("the call was closed")
+        self.closed(self)
         if self._answer is not None:
             await self._answer.aclose()
+        await self._http.aclose()
 
     async def _open(self, request: bytes) -> None:
         post = self._http.build_request(
@@ -126,6 +152,10 @@ class _HttpCall:
             self._error = _error_of(answer)
         self._answer = answer
         self._pieces = answer.aiter_raw()
+
+
+def _nothing(call: _HttpCall) -> None:
+    """Do nothing: the call is in no list yet."""
 
 
 def _lost(http: httpx.AsyncClient, error: Exception) -> ConnectionLost:

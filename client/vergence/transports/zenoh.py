@@ -1,7 +1,9 @@
 """The Zenoh transport: a network of routers and peers with any number of servers."""
 
 import asyncio
+import math
 import random
+import time
 from pathlib import Path
 
 import zenoh
@@ -15,7 +17,10 @@ from vergence_proto.zenoh.keys import ANY, UNARY_KEYS, query_key
 from vergence_proto.zenoh.session import ZenohSession, make_config, reason_of
 
 _ASK_TIMEOUT_S = 1.5  # a slower server counts as absent
-_CONNECT_TIMEOUT_MS = 1000
+_OPEN_TIMEOUT_MS = 5000  # Zenoh's handshake takes three round trips
+# A server that another one could replace gets this long to come back: a router that was restarted
+# sees its servers again within the pause between two of their attempts.
+_HOME_PATIENCE_S = 2.0
 _MAX_MESSAGE_BYTES = 64 << 20  # limit on received messages, far above the largest map
 
 
@@ -30,94 +35,103 @@ class ZenohTransport:
         self._endpoint = endpoint
         self._namespace = namespace
         self._config = config
-        self._peer: ZenohSession | None = None
+        self._peer: ZenohSession | None = None  # for unary methods
         self._closed = False
         self._turn = asyncio.Lock()
         self._calls: dict[str, ZenohCall] = {}  # the latest call of each stream that has not ended
 
     async def open_call(self, stream_id: str) -> Call:
-        peer = await self._connected()
+        # A session of its own: it can connect while the last one's link is dead without knowing it.
+        peer = await self._opened()
         self._calls = {each.stream_id: each for each in self._calls.values() if not each.over}
         before = self._calls.get(stream_id)
-        home = before.server_id if before else ""
 
         async def find(resumes: bool) -> ServerInfos:
-            return await self._servers_for(stream_id, home=home if resumes else "")
+            return await self._servers_for(peer, stream_id, before if resumes else None)
 
-        call = ZenohCall(peer, self._namespace, stream_id, find)
+        call = ZenohCall(peer, self._namespace, stream_id, find, before)
+        if self._closed:
+            await call.close()
+            raise ConnectionLost(f"the connection to {self._endpoint} was closed")
         self._calls[stream_id] = call
         return call
 
     async def ask(self, method: str, request: Message, answer: type[Answer]) -> Answer:
         """Return the first answer, if several servers have one."""
-        return next(iter((await self._ask_all(method, request, answer)).values()))
+        async with self._turn:
+            if self._peer is None:
+                self._peer = await self._opened()
+        return next(iter((await self._ask_all(self._peer, method, request, answer)).values()))
 
     async def close(self) -> None:
+        self._closed = True
         for call in self._calls.values():
-            call.lose(f"the connection to {self._endpoint} was closed")
+            await call.close()
         async with self._turn:
-            self._closed = True
             peer, self._peer = self._peer, None
             if peer is not None:
                 await peer.close()
 
-    async def _connected(self) -> ZenohSession:
-        async with self._turn:
-            if self._closed:
-                raise RuntimeError("the client was closed")
-            if self._peer is None:
-                config = make_config(
-                    self._config,
-                    max_message_bytes=_MAX_MESSAGE_BYTES,
-                    mode="client",
-                    connect__endpoints=[self._endpoint],
-                    connect__timeout_ms=_CONNECT_TIMEOUT_MS,
-                    scouting__multicast__enabled=False,  # overrides the file
-                )
-                peer = ZenohSession(config)
-                try:
-                    await peer.open()
-                except zenoh.ZError as error:
-                    raise self._lost(error) from None
-                self._peer = peer
-            return self._peer
+    async def _opened(self) -> ZenohSession:
+        if self._closed:
+            raise ConnectionLost(f"the connection to {self._endpoint} was closed")
+        config = make_config(
+            self._config,
+            max_message_bytes=_MAX_MESSAGE_BYTES,
+            mode="client",
+            connect__endpoints=[self._endpoint],
+            connect__timeout_ms=0,  # one attempt; the session makes others
+            transport__unicast__open_timeout=_OPEN_TIMEOUT_MS,
+            scouting__multicast__enabled=False,  # overrides the file
+        )
+        peer = ZenohSession(config)
+        try:
+            await peer.open()
+        except zenoh.ZError as error:
+            raise self._lost(error) from None
+        return peer
 
     def _lost(self, error: zenoh.ZError) -> ConnectionLost:
         return ConnectionLost(f"no connection to {self._endpoint}: {reason_of(error)}")
 
-    async def _servers_for(self, stream_id: str, *, home: str) -> ServerInfos:
+    async def _servers_for(
+        self, peer: ZenohSession, stream_id: str, before: ZenohCall | None
+    ) -> ServerInfos:
         """Return the servers for a stream, best first: the one that has it, else by load.
 
-        ``home`` is the server of a stream to resume. Raises ConnectionLost: no server answers, or
-        not ``home``.
+        ``before`` is the last call of a stream to resume. Raises ConnectionLost: no server answers,
+        or not yet the one of ``before``.
         """
+        home = before.server_id if before else ""
         question = pb.GetStreamRequest(stream_id=stream_id)
         # Both at once: a server that hangs costs the whole timeout, and opening has a timeout too.
         infos, holders = await asyncio.gather(
-            self._ask_all("GetServerInfo", pb.GetServerInfoRequest(), pb.GetServerInfoResponse),
-            self._holders(question),
+            self._ask_all(
+                peer, "GetServerInfo", pb.GetServerInfoRequest(), pb.GetServerInfoResponse
+            ),
+            self._holders(peer, question),
         )
-        if home and home not in infos:
+        lost_for_s = time.monotonic() - (before.lost_s or 0.0) if before else math.inf
+        if home not in infos and lost_for_s < _HOME_PATIENCE_S:
             raise ConnectionLost(f"the server of stream {stream_id!r} is not on the network")
-        known = [each for each in holders if each in infos] or [home] * bool(home)
+        known = [each for each in holders if each in infos] or [home] * (home in infos)
         ids = known or sorted(infos, key=lambda each: _load(infos[each]))
         return {each: infos[each] for each in ids}
 
-    async def _holders(self, question: pb.GetStreamRequest) -> list[str]:
+    async def _holders(self, peer: ZenohSession, question: pb.GetStreamRequest) -> list[str]:
         """Return the id of the server that has the stream, if there is one."""
         try:
-            return list(await self._ask_all("GetStream", question, pb.GetStreamResponse))
+            return list(await self._ask_all(peer, "GetStream", question, pb.GetStreamResponse))
         except (UnknownStream, StreamExpired):
             return []
 
     async def _ask_all(
-        self, method: str, question: Message, kind: type[Answer]
+        self, peer: ZenohSession, method: str, question: Message, kind: type[Answer]
     ) -> dict[str, Answer]:
         """Return the answers by server id.
 
         Raises the most specific error if every server refuses; ConnectionLost: no server answers.
         """
-        peer = await self._connected()
         key = query_key(self._namespace, ANY, UNARY_KEYS[method])
         try:
             answers = await peer.query(key, question, timeout_s=_ASK_TIMEOUT_S)

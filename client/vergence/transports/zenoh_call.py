@@ -1,6 +1,7 @@
 """One attachment to a stream over Zenoh: a StreamDepth call made of key expressions."""
 
 import secrets
+import time
 from collections import deque
 from collections.abc import Awaitable, Callable
 
@@ -29,8 +30,6 @@ from vergence_proto.zenoh.session import Declaration, ZenohSession, reason_of
 ServerInfos = dict[str, pb.GetServerInfoResponse]  # by server id, best first
 
 _OPEN_TIMEOUT_S = 3.0
-# A connection open at one end only, or a server that hangs: no liveliness token reports them.
-_PONG_PATIENCE_S = 5.0
 # Above the server's credit; beyond this number the oldest map is discarded.
 _WAITING_MAPS = 16
 # These refusals mean that the server has no room; another one may have.
@@ -50,9 +49,11 @@ class ZenohCall:
         namespace: str,
         stream_id: str,
         find_servers: Callable[[bool], Awaitable[ServerInfos]],
+        before: "ZenohCall | None",
     ) -> None:
         self.stream_id: str = stream_id
-        self.server_id: str = ""  # the server on which the stream is open
+        # The server on which the stream is open, or was at the last call of the stream.
+        self.server_id: str = before.server_id if before else ""
         self.over: bool = False  # True: the server ended the call; it was not lost
         self._peer = peer
         self._namespace = namespace
@@ -64,6 +65,9 @@ class ZenohCall:
         )
         self._declared: list[Declaration] = []
         self._ready: deque[pb.StreamDepthResponse] = deque()
+        # From this time on there was no connection; None: there is one.
+        self.lost_s: float | None = before.lost_s if before else None
+        self._closed = False
         self._live = True
         self._max_frame_bytes = 0
         self._unanswered = Unanswered()
@@ -114,10 +118,13 @@ class ZenohCall:
 
     async def close(self) -> None:
         self.lose("the call was closed")
-        await self._peer.undeclare(*self._declared)
+        if not self._closed:
+            self._closed = True
+            await self._peer.close()
 
     def lose(self, why: str) -> None:
         """End the call as lost; the session resumes it."""
+        self.lost_s = self.lost_s or time.monotonic()
         self._inbox.end(ConnectionLost(why))
 
     async def _open(self, opening: pb.OpenStream) -> None:
@@ -131,17 +138,18 @@ class ZenohCall:
         )
         declared.append(await peer.declare_liveliness(self._keys.client(self._attachment_id)))
         refusal: DepthError = ConnectionLost("no server answers")
-        for self.server_id, info in servers.items():
-            key = query_key(self._namespace, self.server_id, OPEN)
+        for server_id, info in servers.items():
+            key = query_key(self._namespace, server_id, OPEN)
             answers = await peer.query(
                 key, opening, timeout_s=_OPEN_TIMEOUT_S, attachment_id=self._attachment_id
             )
             if not answers:
                 # It may still open the stream, so no other server is asked.
-                raise ConnectionLost(f"server {self.server_id} did not answer")
+                raise ConnectionLost(f"server {server_id} did not answer")
             error = answers[0].error
             if error is None:
                 self._max_frame_bytes = info.max_message_bytes
+                self.server_id, self.lost_s = server_id, None
                 opened = pb.StreamOpened.FromString(answers[0].payload)
                 self._inbox.put_local(pb.StreamDepthResponse(opened=opened))
                 return
@@ -168,9 +176,6 @@ class ZenohCall:
         await self._put(frame, may_drop=self._live)
 
     async def _send_ping(self, ping: pb.Ping) -> None:
-        silent_s = self._unanswered.silent_s(ping.client_ns)
-        if silent_s > _PONG_PATIENCE_S:
-            self.lose(f"server {self.server_id} has not answered for {silent_s:.0f} s")
         self._unanswered.pinged(ping.client_ns)
         await self._put(ping, may_drop=self._live)
 

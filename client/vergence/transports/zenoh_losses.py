@@ -25,10 +25,6 @@ class Unanswered:
         """Record a ping that is sent now."""
         self._last_before[client_ns] = max(self._frames, default=0)
 
-    def silent_s(self, now_ns: int) -> float:
-        """Return the age in seconds of the oldest ping without a pong."""
-        return (now_ns - min(self._last_before, default=now_ns)) * 1e-9
-
     def answered(self, response: pb.StreamDepthResponse) -> list[int]:
         """Record a response; return the ids of the frames that it proves lost, in order."""
         lost: list[int] = []

@@ -8,7 +8,7 @@ are sent from worker threads.
 import asyncio
 import json
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -99,9 +99,11 @@ class ZenohSession:
     async def open(self) -> None:
         """Open the session and learn its ``id``. Call this once, in the event loop to use."""
         self._loop = asyncio.get_running_loop()
+        opening = self._threads.submit(zenoh.open, self._config)
         try:
-            self._session = await self._in_thread(lambda: zenoh.open(self._config))
+            self._session = await asyncio.wrap_future(opening)
         except BaseException:
+            opening.add_done_callback(_close)  # a thread cannot be cancelled
             self._threads.shutdown(wait=False)
             raise
         self.id: str = str(self._session.zid())
@@ -228,6 +230,12 @@ class ZenohSession:
                 self._loop.call_soon_threadsafe(function, *items)
 
         return callback
+
+
+def _close(opening: "Future[zenoh.Session]") -> None:
+    """Close a session that nobody waits for any more."""
+    if not opening.cancelled() and opening.exception() is None:
+        opening.result().close()
 
 
 def _received(reply: zenoh.Reply) -> QueryReply:

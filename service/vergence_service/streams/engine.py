@@ -132,6 +132,11 @@ class DepthEngine:
         StreamExists if it is in use, and Quota, StreamLimit or StateMemory if a limit is reached.
         """
         self._check_model(config)
+        made = self.streams.made_by(stream_id, config.opening_id)
+        if made is not None and attachment is not None:  # the client did not get the answer
+            return self.resume(
+                stream_id, made.resume_token, config, attachment=attachment, client=client
+            )
         need = await self._check_opening(config)
         with self.streams.reserve(stream_id, need, client=client) as place:
             rectifier = await self._rectifier(config.rig)

@@ -72,6 +72,7 @@ class StreamConfig:
     iterations: int = 0  # iterations of a warm step; 0: the server's default
     cold_iterations: int = 0  # iterations of a cold step; 0: the server's default
     weights_sha256: str = ""  # weights that the server must run; empty: any weights
+    opening_id: bytes = b""  # secret with which the opening may be repeated; empty: none
 
 
 @dataclass(slots=True, eq=False)

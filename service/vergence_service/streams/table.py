@@ -209,6 +209,12 @@ class StreamTable:
             )
         raise UnknownStream(f"no open stream {stream_id!r}; open it before sending frames")
 
+    def made_by(self, stream_id: str, opening_id: bytes) -> Stream | None:
+        """Return the open stream that an earlier message of the same opening has made."""
+        stream = self._streams.get(stream_id)
+        same = stream is not None and hmac.compare_digest(opening_id, stream.config.opening_id)
+        return stream if same and opening_id else None
+
     def touch(self, stream: Stream) -> None:
         """Record that the stream is in use: its time until expiry starts again."""
         stream.active_s = self._clock()

@@ -179,6 +179,7 @@ class DepthCall:
             iterations=request.iterations,
             cold_iterations=request.cold_iterations,
             weights_sha256=request.weights_sha256,
+            opening_id=request.opening_id,
         )
         if request.resume_token:
             resumed = self._engine.resume(
