@@ -2,7 +2,7 @@
 
 import asyncio
 import threading
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +10,7 @@ import pytest
 
 from tests.support.frames import RIG, make_frame
 from tests.support.models import RecallModel
-from tests.support.polling import eventually
+from tests.support.polling import eventually, eventually_true
 from tests.support.proxy import proxy_to
 from tests.support.scene import Scene, scene
 from tests.support.server import ManualClock, running_server
@@ -24,7 +24,6 @@ from vergence import (
     Draining,
     EventKind,
     ModelChanged,
-    NotReady,
     NotSent,
     Origin,
     SessionState,
@@ -62,10 +61,15 @@ async def test_a_server_that_loads_its_model_is_waited_for() -> None:
     async with AsyncExitStack() as stack, DepthClient(f"grpc://127.0.0.1:{port}") as client:
         server = running_server(Loading(), grpc__port=port)
         starting = asyncio.create_task(stack.enter_async_context(server))
-        with pytest.raises(NotReady, match="loading"):
-            async with client.open_session(RIG, open_timeout_s=0.5):
-                pass
+
+        async def listens() -> bool:
+            with suppress(ConnectionLost):
+                return bool(await client.server_info())
+            return False
+
         opening = asyncio.create_task(client.open_session(RIG).__aenter__())
+        await eventually_true(listens)
+        assert not opening.done()
         loaded.set()
         session = await opening
         assert (await step(session, 1)).step_count == 1
