@@ -62,7 +62,80 @@ enum { MAX_TAPS = 9 };
             conv_1x##BLOCKS(c, block, tap, taps, x * step, step, out + x * out_step, out_step);     \
     }
 
-#if defined(__AVX512F__)
+#if defined(__AVX2__) && !defined(__AVXVNNI__) && !defined(__AVX512F__)
+#define GROUPED 1
+enum { GROUP_PIXELS = 6 }; /* sums, pairs and weights of more would not fit into 16 registers */
+
+/* SIZE steps at PIXELS pixels: sums of 16 bits, widened once. */
+#define CONV_GROUP(SIZE, PIXELS)                                                                    \
+    static ALWAYS_INLINE void group_##SIZE##x##PIXELS(const uint8_t *const *from, ptrdiff_t at, ptrdiff_t step, \
+                                                      const int8_t *w, __m256i sum[PIXELS][2]) {    \
+        const __m256i one = _mm256_set1_epi16(1);                                                   \
+        for (int p = 0; p < PIXELS; p++) {                                                          \
+            __m256i low = _mm256_setzero_si256(), high = low;                                       \
+            for (int n = 0; n < SIZE; n++) {                                                        \
+                const __m256i *quads = (const __m256i *)(w + 4 * LANES * n);                        \
+                const __m256i four = i_four(from[n] + at + p * step).a;                             \
+                const __m256i first = _mm256_maddubs_epi16(four, _mm256_loadu_si256(quads));        \
+                const __m256i second = _mm256_maddubs_epi16(four, _mm256_loadu_si256(quads + 1));   \
+                low = n ? _mm256_add_epi16(low, first) : first;                                     \
+                high = n ? _mm256_add_epi16(high, second) : second;                                 \
+            }                                                                                       \
+            sum[p][0] = _mm256_add_epi32(sum[p][0], _mm256_madd_epi16(low, one));                   \
+            sum[p][1] = _mm256_add_epi32(sum[p][1], _mm256_madd_epi16(high, one));                  \
+        }                                                                                           \
+    }
+
+#define CONV_GROUPED(PIXELS)                                                                        \
+    CONV_GROUP(4, PIXELS)                                                                           \
+    CONV_GROUP(3, PIXELS)                                                                           \
+    CONV_GROUP(2, PIXELS)                                                                           \
+    CONV_GROUP(1, PIXELS)                                                                           \
+    static inline void grouped_##PIXELS(const Conv *c, int block, const uint8_t *const *from, const int8_t *w, \
+                                        ptrdiff_t at, ptrdiff_t step, uint8_t *out, ptrdiff_t out_step) { \
+        const uint8_t *groups = c->groups[block];                                                   \
+        const Ints bias = i_load(c->bias + LANES * block);                                          \
+        __m256i sum[PIXELS][2];                                                                     \
+        for (int p = 0; p < PIXELS; p++) {                                                          \
+            sum[p][0] = bias.a;                                                                     \
+            sum[p][1] = bias.b;                                                                     \
+        }                                                                                           \
+        for (int g = 0; g < groups[0]; g++, from += 4, w += 16 * LANES)                             \
+            group_4x##PIXELS(from, at, step, w, sum);                                               \
+        for (int g = 0; g < groups[1]; g++, from += 3, w += 12 * LANES)                             \
+            group_3x##PIXELS(from, at, step, w, sum);                                               \
+        for (int g = 0; g < groups[2]; g++, from += 2, w += 8 * LANES)                              \
+            group_2x##PIXELS(from, at, step, w, sum);                                               \
+        for (int g = 0; g < groups[3]; g++, from += 1, w += 4 * LANES)                              \
+            group_1x##PIXELS(from, at, step, w, sum);                                               \
+        for (int p = 0; p < PIXELS; p++)                                                            \
+            i_store_bytes(out + p * out_step + LANES * block, (Ints){sum[p][0], sum[p][1]},         \
+                          c->scale + LANES * block, c->out_zero);                                   \
+    }
+CONV_GROUPED(6)
+CONV_GROUPED(1)
+
+static void conv_row_grouped(const Conv *c, int block, const uint8_t *const *tap, int taps, int pixels, ptrdiff_t step,
+                             uint8_t *out, ptrdiff_t out_step) {
+    const uint8_t *from[MAX_STEPS];
+    const int per_tap = c->ci / 4, steps = taps * per_tap;
+    const int8_t *w = c->grouped + (ptrdiff_t)block * steps * 4 * LANES;
+    for (int n = 0; n < steps; n++) {
+        int at = c->order[block][n];
+        from[n] = tap[at / per_tap] + 4 * (at % per_tap);
+    }
+    int x = 0;
+    for (; x + GROUP_PIXELS <= pixels; x += GROUP_PIXELS)
+        grouped_6(c, block, from, w, x * step, step, out + x * out_step, out_step);
+    if (x < pixels && pixels >= GROUP_PIXELS) {
+        x = pixels - GROUP_PIXELS;
+        grouped_6(c, block, from, w, x * step, step, out + x * out_step, out_step);
+        return;
+    }
+    for (; x < pixels; x++)
+        grouped_1(c, block, from, w, x * step, step, out + x * out_step, out_step);
+}
+#elif defined(__AVX512F__)
 CONV_ROW(12, 1)
 CONV_ROW(10, 2)
 CONV_ROW(8, 3)
@@ -83,6 +156,9 @@ static inline void conv_row(const Conv *c, const uint8_t *const *tap, int taps, 
     case 3: conv_row_3(c, 0, tap, taps, pixels, step, out, out_step); break;
     default: conv_row_4(c, 0, tap, taps, pixels, step, out, out_step);
     }
+#elif defined(GROUPED)
+    for (int block = 0; block * LANES < c->co; block++)
+        conv_row_grouped(c, block, tap, taps, pixels, step, out, out_step);
 #else
     for (int block = 0; block * LANES < c->co; block++)
         conv_row_1(c, block, tap, taps, pixels, step, out, out_step);

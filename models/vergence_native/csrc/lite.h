@@ -25,6 +25,7 @@ enum {
     MAX_ITERATIONS = 16,
     LANES = 16, /* output channels of a block of weights, and floats of a vector */
     MAX_CHANNELS = 64,
+    MAX_STEPS = 144, /* of four inputs, in a convolution: 3x3 of 64 channels */
     MAX_THREADS = 64
 };
 
@@ -44,6 +45,11 @@ typedef struct {
     int in_zero, out_zero;
     float in_step, out_step;
     int8_t *weights; /* [blocks of 16 outputs][tap][ci / 4][16][4] */
+    /* The same in groups of up to four steps (tap, 4 inputs), whose products of two bytes each sum up
+       within 16 bits: [blocks][steps of the groups][16][4]. Groups of four come first, single steps last. */
+    int8_t *grouped;
+    uint8_t order[MAX_CHANNELS / LANES][MAX_STEPS];
+    uint8_t groups[MAX_CHANNELS / LANES][4]; /* how many of four, three, two steps and of one */
     int32_t bias[MAX_CHANNELS];
     float scale[MAX_CHANNELS]; /* from sums to bytes of the output */
 } Conv;

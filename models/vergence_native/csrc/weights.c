@@ -63,8 +63,10 @@ Model *model_new(int iterations) {
 }
 
 static void free_convs(Conv *conv, int count) {
-    for (int i = 0; i < count; i++)
+    for (int i = 0; i < count; i++) {
         free(conv[i].weights);
+        free(conv[i].grouped);
+    }
 }
 
 void model_free(Model *m) {
@@ -107,6 +109,75 @@ static void pack(Conv *c, const int8_t *w) {
                         *out++ = o < c->co ? w[((ptrdiff_t)o * c->ci + i + j) * taps + t] : 0;
 }
 
+/* The sums of each two neighbouring weights of a step, of one sign: what 16 bits must hold. */
+enum { LOADS = 4 * LANES, MOST_LOAD = 128 };
+static void loads_of(const int8_t *step, int loads[LOADS]) {
+    for (int i = 0; i < 2 * LANES; i++) {
+        int a = step[2 * i], b = step[2 * i + 1];
+        loads[2 * i] = (a > 0 ? a : 0) + (b > 0 ? b : 0);
+        loads[2 * i + 1] = (a < 0 ? -a : 0) + (b < 0 ? -b : 0);
+    }
+}
+
+static int largest(const int loads[LOADS]) {
+    int most = 0;
+    for (int i = 0; i < LOADS; i++)
+        most = loads[i] > most ? loads[i] : most;
+    return most;
+}
+
+/* Each step goes to the fullest group that has room for it, the largest first. */
+static void group_block(Conv *c, int block, int steps, int8_t *out) {
+    enum { SIZE = 4 * LANES };
+    const int8_t *in = c->weights + (ptrdiff_t)block * steps * SIZE;
+    static const int empty[LOADS];
+    int held[MAX_STEPS][LOADS], members[MAX_STEPS][4], count[MAX_STEPS], size[MAX_STEPS], done[MAX_STEPS] = {0};
+    int groups = 0;
+    for (int n = 0; n < steps; n++) {
+        int next = -1, loads[LOADS];
+        for (int i = 0; i < steps; i++) {
+            if (n == 0) {
+                loads_of(in + (ptrdiff_t)i * SIZE, loads);
+                size[i] = largest(loads);
+            }
+            if (!done[i] && (next < 0 || size[i] > size[next]))
+                next = i;
+        }
+        done[next] = 1;
+        loads_of(in + (ptrdiff_t)next * SIZE, loads);
+        int best = -1, fullest = -1;
+        for (int g = 0; g < groups; g++) {
+            int sum[LOADS];
+            for (int i = 0; i < LOADS; i++)
+                sum[i] = held[g][i] + loads[i];
+            int most = count[g] < 4 ? largest(sum) : MOST_LOAD + 1;
+            if (most <= MOST_LOAD && most > fullest) {
+                best = g;
+                fullest = most;
+            }
+        }
+        if (best < 0) {
+            best = groups++;
+            count[best] = 0;
+            memcpy(held[best], empty, sizeof empty);
+        }
+        for (int i = 0; i < LOADS; i++)
+            held[best][i] += loads[i];
+        members[best][count[best]++] = next;
+    }
+    int at = 0;
+    for (int wanted = 4; wanted > 0; wanted--)
+        for (int g = 0; g < groups; g++) {
+            if (count[g] != wanted)
+                continue;
+            c->groups[block][4 - wanted]++;
+            for (int i = 0; i < wanted; i++, at++) {
+                c->order[block][at] = (uint8_t)members[g][i];
+                memcpy(out + (ptrdiff_t)at * SIZE, in + (ptrdiff_t)members[g][i] * SIZE, SIZE);
+            }
+        }
+}
+
 static Conv *conv_of(Model *m, int part, int index, Shape *shape) {
     if (part == BEGIN_PART && index >= 0 && index < BEGIN_CONVS)
         return *shape = BEGIN_SHAPES[index], &m->begin.conv[index];
@@ -144,10 +215,14 @@ VN_EXPORT int vn_model_conv(Model *m, int part, int index, const int32_t *dims, 
     c->out_step = out_step;
     c->in_zero = in_zero;
     c->out_zero = out_zero;
-    c->weights = malloc((size_t)count * LANES * (size_t)((shape.co + LANES - 1) / LANES));
-    if (!c->weights)
+    const int blocks = (shape.co + LANES - 1) / LANES;
+    c->weights = malloc((size_t)count * LANES * (size_t)blocks);
+    c->grouped = malloc((size_t)count * LANES * (size_t)blocks);
+    if (!c->weights || !c->grouped)
         return VN_NO_MEMORY;
     pack(c, weights);
+    for (int b = 0; b < blocks; b++)
+        group_block(c, b, count / 4, c->grouped + (ptrdiff_t)b * count * LANES);
     for (int o = 0; o < shape.co; o++) {
         int32_t sum = 0;
         for (int i = 0; i < count; i++)
