@@ -13,7 +13,10 @@ def keep_freed_memory() -> bool:
     A frame allocates and frees megabytes in a dozen pieces. By default, each piece returns to the
     kernel and is faulted in again, page by page, for the next frame. That takes about 1 ms.
     """
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    try:
+        mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    except (OSError, TypeError):  # Windows has no library of that kind
+        return False
     if mallopt is None:
         return False
     return bool(

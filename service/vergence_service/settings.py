@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, V
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict
 from pydantic_settings.sources import InitSettingsSource
 
-from vergence_proto.datasets.files import decoded_text
+from vergence_proto.text import decoded_text
 
 ENV_PREFIX = "VERGENCE_"
 _NESTED = "__"

@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 from tests.support import dataset_trees as trees
 from tests.support import field_trees as field
@@ -91,6 +92,7 @@ DISGUISES: dict[str, Callable[[Path], None]] = {
     "companions": _companions,
     "byte order mark and CR LF": _rewritten(_windows_text),
     "UTF-16": _rewritten(lambda text: text.encode("utf-16")),
+    "UTF-16 without a mark": _rewritten(lambda text: text.encode("utf-16-le")),
     "no line end at the end": _rewritten(lambda text: text.rstrip("\n").encode()),
     "blank lines at the end": _rewritten(lambda text: f"{text}\n \t\n\n".encode()),
     "capital suffixes": _capitals,
@@ -354,6 +356,16 @@ class TestEuroc:
         expected = open_source(f"euroc:{folder}")
         for camera in ("cam0", "cam1"):
             (folder / "mav0" / camera / "data.csv").unlink()
+        _assert_same(expected, open_source(f"euroc:{folder}"))
+
+    def test_a_calibration_may_have_nested_and_block_lists(self, folder: Path) -> None:
+        expected = open_source(f"euroc:{folder}")
+        for camera in ("cam0", "cam1"):
+            path = folder / "mav0" / camera / "sensor.yaml"
+            read = yaml.safe_load(path.read_text())
+            read["T_BS"]["data"] = np.reshape(read["T_BS"]["data"], (4, 4)).tolist()
+            nested = path.read_text().partition("T_BS:")[0] + yaml.safe_dump(read)
+            path.write_text(nested.replace("- - ", "- -\t"))
         _assert_same(expected, open_source(f"euroc:{folder}"))
 
     def test_lost_poses_are_gaps(self, folder: Path) -> None:

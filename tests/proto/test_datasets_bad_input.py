@@ -98,9 +98,13 @@ EUROC = [
     (
         "an unknown distortion",
         _replaced("mav0/cam0/sensor.yaml", "radial-tangential", "omni"),
-        "expected distortion_model radial-tangential or equidistant, got omni",
+        "expected the distortion_model radial-tangential or equidistant, got 'omni'",
     ),
-    ("no T_BS", _replaced("mav0/cam0/sensor.yaml", "data:", "dat:"), "yaml: expected data: [...]"),
+    (
+        "no T_BS",
+        _replaced("mav0/cam0/sensor.yaml", "data:", "dat:"),
+        "sensor.yaml, T_BS: expected numbers",
+    ),
     ("short intrinsics", _replaced("mav0/cam0/sensor.yaml", "20.5, ", ""), "expected 4 numbers"),
     (
         "three coefficients",

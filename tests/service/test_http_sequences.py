@@ -54,10 +54,13 @@ def test_every_error_code_has_an_http_status() -> None:
     assert set(HTTP_STATUS) == set(ErrorCode)
 
 
-def form_files() -> list[tuple[str, bytes]]:
-    sequence = {"calibration": CALIBRATION, "poses": [pose_numbers(frame) for frame in FRAMES]}
+def form_files(*, nested: bool = False) -> list[tuple[str, bytes]]:
+    poses: list[Any] = [pose_numbers(frame) for frame in FRAMES]
+    if nested:
+        poses = [[*np.reshape(pose, (3, 4)).tolist(), [0, 0, 0, 1]] for pose in poses]
+    sequence = json.dumps({"calibration": CALIBRATION, "poses": poses})
     return [
-        ("sequence", json.dumps(sequence).encode()),
+        ("sequence", sequence.encode("utf-8-sig" if nested else "utf-8")),
         *(("left", png(frame.left)) for frame in FRAMES),
         *(("right", png(frame.right)) for frame in FRAMES),
     ]
@@ -83,6 +86,7 @@ UPLOADS: dict[str, dict[str, Any]] = {
     },
     "archive in a form": {"files": {"archive": ARCHIVE}},
     "frames in a form": {"files": form_files()},
+    "matrices in a form with a byte order mark": {"files": form_files(nested=True)},
 }
 
 
@@ -120,7 +124,7 @@ async def test_a_job_tells_how_far_it_is_and_ends_with_its_result() -> None:
 
 async def test_results_come_in_every_format_and_output() -> None:
     async with http_server(RecallModel()) as client:
-        job = await submit(client, ARCHIVE, output=["disparity", "depth", "confidence"])
+        job = await submit(client, ARCHIVE, output=["disparity", "depth", "confidence", "sigma"])
         await ended(client, job["id"])
         exact = await disparities(client, job["id"])
         zips = {

@@ -17,6 +17,7 @@ from tests.support.sequences import (
     CALIBRATION,
     make_frames,
     png,
+    pose_numbers,
     sequence_files,
     with_size,
     zip_bytes,
@@ -108,6 +109,23 @@ async def test_an_image_that_cannot_be_read_costs_its_own_frame(
     with zipfile.ZipFile(io.BytesIO(answer.content)) as file:
         names = [name for name in file.namelist() if name.endswith(".npz")]
     assert names == [f"{index:04d}.npz" for index in range(3) if index not in unread]
+
+
+async def test_a_frame_whose_pose_is_not_known_starts_cold() -> None:
+    frames = make_frames(3)
+    form = {
+        "calibration": CALIBRATION,
+        "poses": [pose_numbers(frames[0]), None, pose_numbers(frames[2])],
+    }
+    files = [("sequence", json.dumps(form).encode())]
+    for frame in frames:
+        files += [("left", png(frame.left)), ("right", png(frame.right))]
+    async with http_server(RecallModel()) as client:
+        answer = await client.post("/v1/sequences", files=files)
+        assert answer.status_code == 202, answer.text
+        job = await ended(client, answer.json()["id"])
+    assert job["state"] == "done"
+    assert job["notes"] == ["poses.txt has no pose for 1 of 3 frames, which start cold"]
 
 
 async def test_a_sequence_of_which_nothing_can_be_read_fails() -> None:

@@ -1,7 +1,12 @@
 """Freed memory is used again and not faulted in for every frame."""
 
+import ctypes
 import subprocess
 import sys
+
+import pytest
+
+from vergence_service.malloc import keep_freed_memory
 
 FRAMES = 20
 SCRIPT = f"""
@@ -26,3 +31,11 @@ print(faults_of_frames())
 def test_frames_are_not_faulted_in_again() -> None:
     run = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True)
     assert int(run.stdout) < FRAMES  # every frame has some 3,000 pages
+
+
+def test_a_system_without_glibc_keeps_its_own_ways(monkeypatch: pytest.MonkeyPatch) -> None:
+    def load(name: str | None) -> object:
+        raise TypeError("LoadLibrary() argument 1 must be str, not None")  # as on Windows
+
+    monkeypatch.setattr(ctypes, "CDLL", load)
+    assert keep_freed_memory() is False

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import cv2
 
-from vergence.cli.errors import CliError
 from vergence.cli.pictures import Row, sheet
 from vergence.cli.streaming import AnsweredFrame
 from vergence_proto.geometry import RectifiedRig
@@ -54,6 +53,6 @@ def shown_in_sheet(count: int | None) -> list[int]:
 
 
 def write_sheet(path: Path, title: str, rows: Sequence[Row], rig: RectifiedRig | None) -> None:
-    """Write a sheet of rows as a picture. Raises CliError: the file cannot be written."""
-    if not cv2.imwrite(str(path), sheet(title, rows, rig=rig)):
-        raise CliError(f"cannot write {path}")
+    """Write a sheet of rows as a picture. Raises OSError: the file cannot be written."""
+    _, file = cv2.imencode(".png", sheet(title, rows, rig=rig))
+    path.write_bytes(file.tobytes())  # by OpenCV itself, names beyond ASCII fail on Windows

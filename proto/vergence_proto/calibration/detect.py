@@ -1,16 +1,10 @@
 """Reading of a calibration file of any known format."""
 
-import json
-import re
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
-
-import yaml
 
 from vergence_proto.calibration import basalt, euroc, kalibr, monado, opencv, own, ros
+from vergence_proto.calibration.fields import read_fields
 from vergence_proto.calibration.parts import Calibration, Fields
-from vergence_proto.datasets.files import DatasetError, read_text
 from vergence_proto.errors import BadCalibration
 
 _PAIRS = (
@@ -52,7 +46,7 @@ def load_calibration(
     first, second = Path(path), None if right is None else Path(right)
     if first.is_dir() and second is None:
         first, second = _in_folder(first)
-    files = [_read(each) for each in (first, second) if each is not None]
+    files = [read_fields(each) for each in (first, second) if each is not None]
     kinds = [_kind(file) for file in files]
     match kinds:
         case ["ros", "ros"]:
@@ -108,46 +102,3 @@ def _in_folder(folder: Path) -> tuple[Path, Path]:
         f"{folder}: expected a calibration file, or a folder with "
         f"{', '.join(' and '.join(pair) for pair in _PAIRS)}"
     )
-
-
-def _read(path: Path) -> Fields:
-    try:
-        text = read_text(path, "a calibration")
-    except DatasetError as error:
-        raise BadCalibration(str(error)) from None
-    if re.match(r"%YAML:|<\?xml|<opencv_storage", text) or "opencv-matrix" in text:
-        return Fields.of(path, _file_storage(path, text))
-    try:
-        # Of several documents, as a printed message has them, the first.
-        read = json.loads(text) if text.lstrip().startswith("{") else _first_document(text)
-    except (yaml.YAMLError, json.JSONDecodeError) as error:
-        raise BadCalibration(f"{path}: neither YAML nor JSON: {error}".replace("\n", " ")) from None
-    return Fields.of(path, read)
-
-
-def _first_document(text: str) -> Any:
-    return next(iter(yaml.safe_load_all(text)), None)
-
-
-def _file_storage(path: Path, text: str) -> Mapping[str, Any]:
-    import cv2  # here: the only format that needs it
-
-    try:
-        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        names = storage.root().keys() if storage.isOpened() else ()
-        return {name: _value(storage.getNode(name)) for name in names}
-    except cv2.error as error:
-        raise BadCalibration(f"{path}: damaged: {error.err}") from None
-
-
-def _value(node: Any) -> Any:
-    if node.isReal() or node.isInt():
-        return node.real()
-    if node.isString():
-        return node.string()
-    if node.isSeq():
-        return [_value(node.at(index)) for index in range(node.size())]
-    if node.isMap():
-        matrix = node.mat()
-        return None if matrix is None else matrix.tolist()
-    return None

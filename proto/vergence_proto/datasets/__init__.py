@@ -165,8 +165,8 @@ def find_sources(spec: str) -> list[str]:
     Raises DatasetError: the kind is unknown, or there is no such folder.
     """
     kind, path, _ = _parsed(spec)
-    _, question, options = spec.partition("?")
-    return [f"{kind}:{each}{question}{options}" for each in DATASETS[kind].find(path)]
+    options = spec.removeprefix(f"{kind}:").removeprefix(_location(spec))
+    return [f"{kind}:{each}{options}" for each in DATASETS[kind].find(path)]
 
 
 def detect_sources(folder: Path) -> list[str]:
@@ -199,12 +199,19 @@ def _noted(source: StereoSource) -> StereoSource:
     return replace(source, notes=(*source.notes, note))
 
 
+def _location(spec: str) -> str:
+    """The path of a spec, without its options; a folder may have a question mark in its name."""
+    rest = spec.partition(":")[2]
+    return rest if Path(rest).exists() else rest.rpartition("?")[0] or rest
+
+
 def _parsed(spec: str) -> tuple[str, Path, dict[str, float]]:
     kind, colon, rest = spec.partition(":")
+    location = _location(spec)
     if not colon or kind not in DATASETS:
         kinds = ", ".join(f"{known}:PATH" for known in DATASETS)
         raise DatasetError(f"{spec!r}: expected one of {kinds}")
-    location, _, query = rest.partition("?")
+    query = rest.removeprefix(location).removeprefix("?")
     path = Path(location)
     if not (path.is_dir() or path.parent.is_dir()):
         raise DatasetError(f"{path}: no such folder")

@@ -12,27 +12,23 @@ Rows may be in any order, and both images of a pair may have stamps up to half a
 Without ``data.csv`` the names of the images are their stamps.
 """
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PureWindowsPath
 
 import numpy as np
 
-from vergence_proto.datasets.files import DatasetError, numbers, read_text
+from vergence_proto.calibration import euroc as calibration
+from vergence_proto.calibration.fields import read_fields
+from vergence_proto.datasets.files import DatasetError, numbers
 from vergence_proto.datasets.listing import found, image_beside, images
-from vergence_proto.datasets.poses import checked_orientation, checked_pose, interpolated
+from vergence_proto.datasets.poses import checked_orientation, interpolated
 from vergence_proto.datasets.source import FrameFiles, StereoSource
 from vergence_proto.datasets.stamps import pairs_of, read_stamped
 from vergence_proto.errors import BadCalibration
 from vergence_proto.geometry import Matrix, Pose
-from vergence_proto.types import Distortion, Intrinsics, StereoRig
 
 _TRUTHS = ("state_groundtruth_estimate0", "mocap0")
 _APART_MS = 1.0  # more is worth a note: a moving camera is elsewhere by then
-_DISTORTIONS = {
-    "radial-tangential": Distortion.BROWN_CONRADY,
-    "equidistant": Distortion.KANNALA_BRANDT,
-}
 
 
 def find(root: Path) -> list[Path]:
@@ -46,12 +42,12 @@ def open_path(path: Path) -> StereoSource:
     Raises DatasetError: a file is missing or wrong.
     """
     mav = path / "mav0" if (path / "mav0").is_dir() else path
-    body_from_left, left = _read_camera(mav / "cam0" / "sensor.yaml")
-    body_from_right, right = _read_camera(mav / "cam1" / "sensor.yaml")
+    files = tuple(mav / camera / "sensor.yaml" for camera in ("cam0", "cam1"))
     try:
-        rig = StereoRig(left, right, body_from_left.inverse() @ body_from_right)
+        left, right = (read_fields(file) for file in files)
+        rig, body_from_left = calibration.read(left, right).rig, left.pose("T_BS")
     except BadCalibration as error:
-        raise DatasetError(f"{mav / 'cam1' / 'sensor.yaml'}: {error}") from None
+        raise DatasetError(str(error)) from None
     lefts, rights = (_read_images(mav / camera) for camera in ("cam0", "cam1"))
     pairs_ns = pairs_of([*lefts], [*rights])
     if not pairs_ns:
@@ -61,7 +57,7 @@ def open_path(path: Path) -> StereoSource:
         )
     times_ns = [left_ns for left_ns, _ in pairs_ns]
     poses, notes = _body_poses(mav, times_ns)
-    files = [
+    frames = [
         FrameFiles(
             lefts[left_ns],
             rights[right_ns],
@@ -73,7 +69,7 @@ def open_path(path: Path) -> StereoSource:
     fps = 1e9 / float(np.median(np.diff(times_ns))) if len(times_ns) > 1 else None
     name = mav.parent.name if mav.name == "mav0" else mav.name
     notes = (*_notes_on_pairs(mav, lefts, rights, pairs_ns), *notes)
-    return StereoSource(name, rig, fps, files, notes)
+    return StereoSource(name, rig, fps, frames, notes)
 
 
 def _notes_on_pairs(
@@ -88,37 +84,6 @@ def _notes_on_pairs(
     apart_ms = max(abs(right_ns - left_ns) for left_ns, right_ns in pairs_ns) / 1e6
     if apart_ms > _APART_MS:
         yield f"{mav}: left and right images are up to {apart_ms:.1f} ms apart"
-
-
-def _read_camera(path: Path) -> tuple[Pose, Intrinsics]:
-    """Read body_from_camera and the intrinsics."""
-    text = read_text(path, "a camera's calibration")
-    body_from_camera = checked_pose(
-        np.reshape(_list(path, text, "data", 16), (4, 4)), f"{path}, T_BS"
-    )
-    width, height = _list(path, text, "resolution", 2)
-    model = re.search(r"^distortion_model:\s*([\w-]+)", text, re.MULTILINE)
-    if model is None or model[1] not in _DISTORTIONS:
-        raise DatasetError(
-            f"{path}: expected distortion_model {' or '.join(_DISTORTIONS)}, "
-            f"got {model[1] if model else 'none'}"
-        )
-    fx, fy, cx, cy = _list(path, text, "intrinsics", 4)
-    coefficients = tuple(_list(path, text, "distortion_coefficients", None))
-    try:
-        return body_from_camera, Intrinsics(
-            int(width), int(height), fx, fy, cx, cy, _DISTORTIONS[model[1]], coefficients
-        )
-    except BadCalibration as error:
-        raise DatasetError(f"{path}: {error}") from None
-
-
-def _list(path: Path, text: str, key: str, count: int | None) -> list[float]:
-    """Read a list of numbers, on one line or several; these files use only a little of YAML."""
-    found = re.search(rf"^\s*{key}:\s*\[([^\]]*)\]", text, re.MULTILINE)
-    if found is None:
-        raise DatasetError(f"{path}: expected {key}: [...], found none")
-    return numbers(found[1], count, f"{path}, {key}")
 
 
 def _read_images(camera: Path) -> Mapping[int, Path]:

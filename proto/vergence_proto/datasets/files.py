@@ -1,10 +1,5 @@
-"""Checked reading of small files, and the error that every reader raises.
+"""Checked reading of small files, and the error that every reader raises."""
 
-Text may be UTF-8 or UTF-16, with or without a byte order mark, and its lines may end with CR LF, as
-Windows writes them.
-"""
-
-import codecs
 import json
 import re
 import zipfile
@@ -16,16 +11,11 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from vergence_proto.text import decoded_text
+
 JsonObject = Mapping[str, object]
 
-_BYTE_ORDER_MARKS = {
-    codecs.BOM_UTF8: "utf-8-sig",
-    codecs.BOM_UTF32_LE: "utf-32",  # starts like UTF-16, so it comes first
-    codecs.BOM_UTF16_LE: "utf-16",
-    codecs.BOM_UTF16_BE: "utf-16",
-}
 _TRAILING_COMMA = re.compile(r",(\s*[}\]])")  # of lists that were edited by hand
-_NO_TEXT = re.compile("[\x00-\x08\x0e-\x1f]")
 
 
 class DatasetError(ValueError):
@@ -40,7 +30,7 @@ def existing(path: Path, purpose: str) -> Path:
 
 
 def read_text(path: Path, purpose: str) -> str:
-    """Read text of any encoding that :func:`decoded_text` knows.
+    """Read text of any encoding that :func:`~vergence_proto.text.decoded_text` knows.
 
     Raises DatasetError: there is no such file, or it is not text.
     """
@@ -48,22 +38,6 @@ def read_text(path: Path, purpose: str) -> str:
     if text is None:
         raise DatasetError(f"{path}: expected text, {purpose}")
     return text
-
-
-def decoded_text(data: bytes) -> str | None:
-    """Decode UTF-8, UTF-16 or UTF-32 by its byte order mark, else UTF-8, else Latin-1.
-
-    The mark is taken off. None: it is not text.
-    """
-    marked = (name for mark, name in _BYTE_ORDER_MARKS.items() if data.startswith(mark))
-    encoding = next(marked, "utf-8")
-    try:
-        text = data.decode(encoding)
-    except UnicodeDecodeError:
-        if encoding != "utf-8":
-            return None
-        text = data.decode("latin-1")  # older editors wrote the degree sign and the like so
-    return None if _NO_TEXT.search(text) else text
 
 
 def read_lines(path: Path, purpose: str) -> list[str]:

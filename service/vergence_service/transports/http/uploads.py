@@ -10,15 +10,15 @@ from collections.abc import AsyncIterator, Iterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import Request
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
 from starlette.requests import ClientDisconnect
 
 from vergence_proto.codec.image_files import ImageKind, image_kind
-from vergence_proto.datasets.files import decoded_text
 from vergence_proto.errors import BadSequence, UploadTooLarge
+from vergence_proto.text import decoded_text
 from vergence_service.jobs.archives import ArchiveLimits, unpacking
 from vergence_service.threads import ThreadPool
 from vergence_service.transports.http.bodies import body_of
@@ -66,16 +66,32 @@ class Calibration(BaseModel):
     fps: Annotated[FiniteFloat, Field(gt=0)] | None = None
 
 
+def _flat(pose: Any) -> Any:
+    """Make one list of a matrix as lists of rows; anything else is for the validation to judge."""
+    if isinstance(pose, list) and pose and all(isinstance(row, list) for row in pose):
+        return [number for row in pose for number in row]
+    return pose
+
+
+_Numbers = list[FiniteFloat]
+_PoseRow = Annotated[
+    Annotated[_Numbers, Field(min_length=12, max_length=12)]
+    | Annotated[_Numbers, Field(min_length=16, max_length=16)],
+    BeforeValidator(_flat),
+]
+_LOST = " ".join(["nan"] * 12)  # as trackers write it
+
+
 class SequenceForm(BaseModel):
     """The calibration and the poses of the images of a form."""
 
     model_config = ConfigDict(extra="forbid")
 
     calibration: Calibration
-    poses: list[Annotated[list[FiniteFloat], Field(min_length=12, max_length=12)]] | None = Field(
+    poses: list[_PoseRow | None] | None = Field(
         default=None,
-        description="pose of each frame: 3x4 camera-to-world matrix, row by row; left camera, "
-        "OpenCV axes, metres",
+        description="pose of each frame: 3x4 camera-to-world matrix, row by row, flat or as lists "
+        "of rows, also with the row 0 0 0 1; left camera, OpenCV axes, metres; null: not known",
     )
 
 
@@ -224,7 +240,7 @@ def _writing_layout(
     calibration = form.calibration.model_dump(exclude_none=True)
     (target / "calib.json").write_text(json.dumps(calibration), "utf-8")
     if form.poses is not None:
-        lines = (" ".join(map(repr, pose)) for pose in form.poses)
+        lines = (_LOST if pose is None else " ".join(map(repr, pose)) for pose in form.poses)
         (target / "poses.txt").write_text("\n".join(lines), "utf-8")
     for side, images in (("left", left), ("right", right)):
         for index, image in enumerate(images):
