@@ -21,6 +21,17 @@ _MIB = 1 << 20
 # Kept free below a limit of the process: the network buffers of gRPC end the process if they cannot
 # be allocated, and every thread takes address space.
 _KEPT_FREE = 384 * _MIB
+_LEAST = 64 * _MIB
+
+
+class TooLittleMemory(MemoryError):
+    """The limit on the process leaves too little memory to serve."""
+
+    def __init__(self, limit_bytes: int) -> None:
+        super().__init__(
+            f"the limit of {_mib(limit_bytes)} on this process's address space leaves no memory "
+            "for streams; raise it (ulimit -v)"
+        )
 
 
 class MemoryKind(StrEnum):
@@ -124,12 +135,13 @@ class MemoryBudget:
         use too much of it.
         """
         self.check_possible(need)
-        steps = max(need.step, self.used(MemoryKind.STEPS))
-        beside = self._used_beside_steps()
-        if beside + need.total - need.step + steps > self._limit:
+        steps = self.used(MemoryKind.STEPS)
+        used = self._used_beside_steps() + steps
+        more = need.total - need.step + max(need.step - steps, 0)
+        if used + more > self._limit:
             raise StateMemory(
-                f"the stream needs {_mib(need.total)} of memory; {_mib(beside + steps)} of "
-                f"{_mib(self._limit)} are in use; close a stream, or try again later (the server's "
+                f"the stream needs {_mib(more)} of memory; {_mib(used)} of {_mib(self._limit)} are "
+                "in use; close a stream, or try again later (the server's "
                 "setting limits.max_state_mib)"
             )
         held = {
@@ -214,7 +226,7 @@ def affordable_bytes(wanted: int) -> int:
     """Return how many bytes the budget can have, ``wanted`` at most.
 
     A limit on the address space of the process (``ulimit -v``) leaves less. Call it when the model
-    is loaded.
+    is loaded. Raises TooLittleMemory if it leaves almost none.
     """
     if sys.platform != "linux":
         return wanted
@@ -222,7 +234,10 @@ def affordable_bytes(wanted: int) -> int:
     if soft == resource.RLIM_INFINITY:
         return wanted
     pages = int(Path("/proc/self/statm").read_text().split()[0])
-    return max(min(wanted, soft - pages * resource.getpagesize() - _KEPT_FREE), 0)
+    left = soft - pages * resource.getpagesize() - _KEPT_FREE
+    if left < _LEAST:
+        raise TooLittleMemory(soft)
+    return min(wanted, left)
 
 
 def _mib(nbytes: int) -> str:

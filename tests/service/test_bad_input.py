@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.support.frames import RIG, frame_message, make_frame, open_message
-from tests.support.models import NOT_FINITE, RAISES, RecallModel
+from tests.support.models import NO_MEMORY, NOT_FINITE, RAISES, RecallModel
 from tests.support.server import RawCall, connected, raw_stream, running_server
 from tests.support.status import reason_of
 from vergence_proto.errors import ERROR_CLASSES, BadImage, BadPose, ErrorCode
@@ -89,6 +89,7 @@ def too_large(frame: pb.Frame) -> None:
         pytest.param(out_of_order, "FRAME_OUT_OF_ORDER", "above 1", id="out-of-order"),
         pytest.param(too_large, "FRAME_TOO_LARGE", "1048576", id="too-large"),
         pytest.param(first_pixel(RAISES), "MODEL_FAILED", "unchanged", id="model-raises"),
+        pytest.param(first_pixel(NO_MEMORY), "STATE_MEMORY", "nothing has changed", id="no-memory"),
         pytest.param(first_pixel(NOT_FINITE), "NON_FINITE", "finite", id="not-finite"),
     ],
 )

@@ -1,6 +1,8 @@
 """One budget: what is reserved never exceeds it, and everything comes back."""
 
 import asyncio
+import subprocess
+import sys
 
 import pytest
 from hypothesis import strategies as st
@@ -131,3 +133,27 @@ def test_steps_run_side_by_side_only_in_memory_that_nothing_else_uses() -> None:
             assert memory.used(MemoryKind.STEPS) == 85
             assert not memory.may_step(10)
     assert memory.may_step(1000), "one step always may: its stream reserved it"
+
+
+_UNDER_A_LIMIT = """
+import resource
+from vergence_service.memory import TooLittleMemory, affordable_bytes
+
+used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+print(affordable_bytes(1 << 40) == 1 << 40)
+resource.setrlimit(resource.RLIMIT_AS, (used + (1 << 30),) * 2)
+print(0 < affordable_bytes(1 << 40) < 1 << 30, affordable_bytes(1 << 20) == 1 << 20)
+resource.setrlimit(resource.RLIMIT_AS, (used + (1 << 28), used + (1 << 30)))
+try:
+    affordable_bytes(1 << 30)
+except TooLittleMemory as error:
+    print("ulimit -v" in str(error))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the limit and /proc are Linux's")
+def test_a_limit_on_the_address_space_leaves_less() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _UNDER_A_LIMIT], capture_output=True, text=True, check=False
+    )
+    assert done.stdout.split() == ["True"] * 4, done.stderr

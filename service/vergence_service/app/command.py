@@ -8,14 +8,14 @@ import threading
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from vergence_proto.model_io import ManifestError
 from vergence_service.app.server import Running, serve
 from vergence_service.descriptors import raise_descriptor_limit
 from vergence_service.inference.providers import ProviderUnavailable
 from vergence_service.logs import start_logging
-from vergence_service.malloc import keep_freed_memory
+from vergence_service.malloc import keep_freed_memory, save_address_space
 from vergence_service.settings import SettingsError, load_settings
 from vergence_service.transports.errors import ExtraMissing, PortTaken, ZenohUnreachable
 
@@ -49,13 +49,24 @@ def run_server(
             sys.stdout.write(settings.to_toml())
             return
         start_logging(settings.log_level)
+        save_address_space()
         keep_freed_memory()
         raise_descriptor_limit()
         ending = partial(_end_after, 2 * settings.server.drain_s)
         asyncio.run(serve(settings, on_serving=_announce, on_stopping=ending, until_eof=until_eof))
+    except MemoryError as error:
+        _fail(str(error) or "the process has no memory left; raise its limits (ulimit -v)")
     except _OPERATOR_ERRORS as error:
-        sys.stderr.write(f"vergence serve: {error}\n")
-        raise SystemExit(2) from None
+        _fail(str(error))
+    except RuntimeError as error:
+        if "can't start new thread" not in str(error):
+            raise
+        _fail("the process can start no more threads; raise its limits (ulimit -u, ulimit -v)")
+
+
+def _fail(why: str) -> NoReturn:
+    sys.stderr.write(f"vergence serve: {why}\n")
+    raise SystemExit(2) from None
 
 
 def _end_after(seconds: float) -> None:

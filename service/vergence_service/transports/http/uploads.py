@@ -35,7 +35,7 @@ ARCHIVE_TYPES = (
     "application/x-bzip2",
     "application/octet-stream",
 )
-_LARGEST_JSON = 32 << 20
+_LARGEST_JSON = 8 << 20  # its numbers take a dozen times the memory
 _EXTENSIONS = {ImageKind.PNG: "png", ImageKind.JPEG: "jpg", ImageKind.WEBP: "webp"}
 
 
