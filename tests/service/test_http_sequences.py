@@ -132,6 +132,10 @@ async def test_results_come_in_every_format_and_output() -> None:
             for form in ("png16", "pfm", "npz", "mp4")
         }
     depths = [RIG.depth_from_disparity(each) for each in exact]
+    with zipfile.ZipFile(io.BytesIO(zips["npz"].content)) as file:
+        arrays = dict(np.load(io.BytesIO(file.read("0005.npz"))))
+    np.testing.assert_array_equal(arrays["depth"], depths[5])
+    assert {*arrays} == {"disparity", "depth", "confidence", "sigma"}
     for form, extension in (("png16", "png"), ("pfm", "pfm")):
         with zipfile.ZipFile(io.BytesIO(zips[form].content)) as file:
             assert file.testzip() is None
@@ -142,12 +146,11 @@ async def test_results_come_in_every_format_and_output() -> None:
                     np.testing.assert_allclose(
                         read_back(content, extension), plane, atol=0 if form == "pfm" else 1 / 512
                     )
-            confidence = np.frombuffer(file.read("confidence/0005.png"), np.uint8)
-            assert np.asarray(cv2.imdecode(confidence, cv2.IMREAD_UNCHANGED)).dtype == np.uint8
-    with zipfile.ZipFile(io.BytesIO(zips["npz"].content)) as file:
-        arrays = np.load(io.BytesIO(file.read("0000.npz")))
-        np.testing.assert_array_equal(arrays["depth"], depths[0])
-        assert set(arrays) == {"disparity", "depth", "confidence"}
+            stored = np.frombuffer(file.read("confidence/0005.png"), np.uint8)
+            confidence = cv2.imdecode(stored, cv2.IMREAD_UNCHANGED)
+            np.testing.assert_array_equal(confidence, arrays["confidence"])
+            sigma_px = read_back(file.read(f"sigma/0005.{extension}"), extension)
+            np.testing.assert_allclose(sigma_px, np.minimum(arrays["sigma"], 65535 / 256), 0, 1e-2)
     assert zips["mp4"].headers["Content-Type"] == "video/mp4"
     with av.open(io.BytesIO(zips["mp4"].content), "r") as film:
         assert film.streams.video[0].codec_context.name == "h264"  # every browser plays it
