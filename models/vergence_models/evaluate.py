@@ -21,6 +21,7 @@ from pathlib import Path
 from rich.progress import Progress
 
 from vergence_models.data.pool import ClipPool
+from vergence_models.evaluation.direct_labels import End, label_ends
 from vergence_models.evaluation.evidence import SURE, Doubt, doubts_of
 from vergence_models.evaluation.methods import (
     Method,
@@ -200,6 +201,10 @@ def as_json(results: Results) -> dict[str, object]:
     }
 
 
+# Left, bottom, width and height of the two axes, as shares of the figure.
+_BOXES = ((0.05, 0.13, 0.36, 0.77), (0.74, 0.13, 0.24, 0.77))
+
+
 def draw_plots(results: Results, folder: Path) -> None:
     """One PNG per group: EPE against the frame's number, and the calibration of sigma."""
     import matplotlib as mpl
@@ -209,19 +214,23 @@ def draw_plots(results: Results, folder: Path) -> None:
 
     folder.mkdir(parents=True, exist_ok=True)
     for group, accumulators in results.items():
-        figure, (start, trust) = plt.subplots(1, 2, figsize=(11, 4), width_ratios=(3, 2))
-        for name, accumulator in accumulators.items():
-            epes = accumulator.epe_by_frame()
-            start.plot(range(1, len(epes) + 1), epes, label=name, marker="." * (len(epes) < 2))
+        figure = plt.figure(figsize=(13, 4))
+        # The names of the curves stand between the two.
+        start, trust = (figure.add_axes(box) for box in _BOXES)
+        ends = []
+        for index, (name, accumulator) in enumerate(accumulators.items()):
+            shade, epes = f"C{index}", accumulator.epe_by_frame()
+            start.plot(range(1, len(epes) + 1), epes, color=shade, marker="." * (len(epes) < 2))
+            if epes:
+                ends.append(End(name, len(epes), epes[-1], shade))
             summary = accumulator.summary()
             reported = [summary[f"within_{s}"] for s in SHARES_PCT if f"within_{s}" in summary]
             if reported:
-                trust.plot(SHARES_PCT, reported, marker=".", label=name)
+                trust.plot(SHARES_PCT, reported, marker=".", color=shade)
         start.set(xlabel="frame", ylabel="EPE [px]", title=group, ylim=(0, None))
-        start.legend(fontsize="small")
+        label_ends(start, ends)
         trust.plot((0, 100), (0, 100), color="0.7", linestyle=":")
         trust.set(xlabel="interval of sigma [%]", ylabel="errors inside [%]", title="calibration")
-        figure.tight_layout()
         figure.savefig(folder / f"{group.replace(' ', '_')}.png", dpi=110)
         plt.close(figure)
 

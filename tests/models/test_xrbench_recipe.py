@@ -203,8 +203,11 @@ def test_what_is_written_reads_as_sceneflow(camera: StereoCamera, tmp_path: Path
                 np.testing.assert_array_equal(read.frame.left, camera.clean(frame, Eye.LEFT))
                 np.testing.assert_array_equal(read.frame.right, camera.clean(frame, Eye.RIGHT))
     sheet = contact_sheet(tmp_path, recipe.name, 0)
-    assert sheet.shape == (2 * 24, 3 * 32, 3)
-    np.testing.assert_array_equal(sheet[:24, :32], camera.clean(0, Eye.LEFT))
+    # Each tile is 320 wide here, ten times its size, with margins of 8 and a name below.
+    assert sheet.shape == (2 * (240 + 40), 3 * (320 + 16), 3)
+    first = sheet[8 : 8 + 240, 8 : 8 + 320]
+    np.testing.assert_array_equal(first[5::10, 5::10], camera.clean(0, Eye.LEFT))
+    assert sheet[8 + 240 : 240 + 40, :320].std() > 5  # its name
 
 
 def test_every_file_of_a_frame_holds_what_is_known_of_it(

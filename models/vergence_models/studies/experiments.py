@@ -123,7 +123,7 @@ def warp_ablation(bench: Bench) -> Table:
         training=training_of(bench.networks),
         findings=warp_findings(cells),
         paper=[
-            TableRow(row.label, row.values | {"loss": loss_pct(row.values)}) for row in paper.SPEED
+            TableRow(row.label, row.values | {"loss": loss_pct(row.values)}) for row in paper.WARP
         ],
         paper_note=paper.SOURCE,
     )
@@ -181,7 +181,8 @@ def pose_noise(bench: Bench, levels: Sequence[int] = range(11)) -> Table:
         rows=[TableRow(label, values) for label, values in cells.items()],
         training=training_of(bench.networks),
         findings=noise_findings(cells),
-        paper_note=paper.NOISE_NOTE,
+        paper=paper.NOISE,
+        paper_note=paper.SOURCE,
         curves=[
             Curve(label, [float(k) for k in levels], list(values.values()))
             for label, values in cells.items()

@@ -14,25 +14,52 @@ from vergence_proto.datasets import read_image, read_pfm
 
 Image = NDArray[np.uint8]  # [H, W, 3], RGB
 
+_TILE_WIDTH, _NAME_HEIGHT, _MARGIN = 320, 40, 8
+_BACKGROUND, _INK = (21, 24, 29), (220, 224, 228)
+
 
 def contact_sheet(folder: Path, name: str, frame: int) -> Image:
-    """The passes there are, disparity, flow, normals, and objects in their boxes: [H, W, 3], RGB.
+    """The passes there are and all truths of a frame, each with its name: [H, W, 3], RGB.
 
     Raises DatasetError: a file of the frame is missing or damaged.
     """
     left = Path(name) / "left"
-    passes = [folder / f"frames_{each}pass" / left / f"{frame:04d}.png" for each in PASSES]
-    tiles = [read_image(path) for path in passes if path.exists()]
-    tiles.append(_heat(read_pfm(folder / "disparity" / left / f"{frame:04d}.pfm")))
+    passes = {each: folder / f"frames_{each}pass" / left / f"{frame:04d}.png" for each in PASSES}
+    tiles = {
+        f"left image, {each} pass": read_image(path)
+        for each, path in passes.items()
+        if path.exists()
+    }
+    disparity_px = read_pfm(folder / "disparity" / left / f"{frame:04d}.pfm")
+    far, near = np.nanpercentile(disparity_px, (1, 99))
+    tiles[f"disparity, {far:.0f} (blue) to {near:.0f} px (red)"] = _heat(disparity_px)
     flow = folder / "optical_flow" / name / "into_future" / "left"
-    tiles.append(_wheel(_read_flow(flow / f"OpticalFlowIntoFuture_{frame:04d}_L.pfm")))
-    tiles.append(read_image(folder / "normals" / left / f"{frame:04d}.png"))
+    flow_px = _read_flow(flow / f"OpticalFlowIntoFuture_{frame:04d}_L.pfm")
+    fastest = np.nanpercentile(np.hypot(flow_px[..., 0], flow_px[..., 1]), 99)
+    tiles[f"flow to the next frame, up to {fastest:.1f} px"] = _wheel(flow_px)
+    tiles["normals"] = read_image(folder / "normals" / left / f"{frame:04d}.png")
     boxes = json.loads((folder / "object_boxes" / name / f"{frame:04d}.json").read_text("utf-8"))
     label = folder / "object_index" / left / f"{frame:04d}.png"
-    tiles.append(_objects(np.asarray(cv2.imread(str(label), cv2.IMREAD_UNCHANGED)), boxes))
-    across = (len(tiles) + 1) // 2
-    tiles += [np.zeros_like(tiles[0])] * (2 * across - len(tiles))
-    return np.vstack([np.hstack(tiles[:across]), np.hstack(tiles[across:])])
+    tiles["objects and their boxes"] = _objects(
+        np.asarray(cv2.imread(str(label), cv2.IMREAD_UNCHANGED)), boxes
+    )
+    named = [_named(tile, words) for words, tile in tiles.items()]
+    across = (len(named) + 1) // 2
+    named += [np.full_like(named[0], _BACKGROUND)] * (2 * across - len(named))
+    return np.vstack([np.hstack(named[:across]), np.hstack(named[across:])])
+
+
+def _named(tile: Image, words: str) -> Image:
+    """A tile of one width, with a margin and its name below."""
+    height, width = (round(side * _TILE_WIDTH / tile.shape[1]) for side in tile.shape[:2])
+    way = cv2.INTER_NEAREST if width > tile.shape[1] else cv2.INTER_AREA
+    picture = np.full((height + _NAME_HEIGHT, width + 2 * _MARGIN, 3), _BACKGROUND, np.uint8)
+    picture[_MARGIN : _MARGIN + height, _MARGIN : _MARGIN + width] = cv2.resize(
+        tile, (width, height), interpolation=way
+    )
+    place = (_MARGIN, height + _NAME_HEIGHT - 10)
+    cv2.putText(picture, words, place, cv2.FONT_HERSHEY_DUPLEX, 0.45, _INK, 1, cv2.LINE_AA)
+    return picture
 
 
 def _heat(disparity_px: NDArray[np.float32]) -> Image:
