@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from vergence.attaching import OnLost
 from vergence.client import DepthClient
 from vergence.errors import NotOpen
-from vergence.info import ModelInfo, ServerInfo, StreamInfo
-from vergence.reprojection import DepthView, Fill, View
-from vergence.results import DepthResult, Drops, NotSent, SessionEvent, SessionState
+from vergence.info import ServerInfo, StreamInfo
+from vergence.results import DepthResult, NotSent, SessionEvent
 from vergence.session import DepthSession, WorldFromLeft
+from vergence.session_facts import SessionFacts
 from vergence.transports.addresses import DEFAULT_SERVER
 from vergence.transports.forks import FORKED
-from vergence_proto.geometry import Axes, Matrix, Pose, RectifiedRig
-from vergence_proto.types import Delivery, ImageEncoding, OutputFormat, PoseSample, StereoRig
+from vergence_proto.geometry import Axes, RectifiedRig
+from vergence_proto.types import Delivery, ImageEncoding, OutputFormat, StereoRig
 
 Value = TypeVar("Value")
 
@@ -126,7 +126,7 @@ class _LoopThread:
         return self.wait(run())
 
 
-class BlockingSession:
+class BlockingSession(SessionFacts):
     """A :class:`DepthSession` whose ``step`` returns and whose iteration is ``for``.
 
     :meth:`BlockingClient.open_session` makes it; use it inside ``with``. Every method but
@@ -134,6 +134,7 @@ class BlockingSession:
     """
 
     def __init__(self, session: DepthSession, loop: _LoopThread, /) -> None:
+        super().__init__(session._parts)  # noqa: SLF001  the same session, for other callers
         self._session = session
         self._loop = loop
 
@@ -145,30 +146,6 @@ class BlockingSession:
     def __exit__(self, *exc_info: object) -> None:
         """End the stream; the server frees its state."""
         self._loop.wait(self._session.__aexit__(*exc_info))
-
-    @property
-    def state(self) -> SessionState:
-        """The state of the connection; silence shows after 1 s, or three round trips."""
-        return self._session.state
-
-    @property
-    def latest(self) -> DepthResult | None:
-        """The newest result so far; None before the first. Any thread may read it, at any time."""
-        return self._session.latest
-
-    def depth_at(
-        self,
-        world_from_view: Pose | PoseSample | Matrix,
-        view: View | None = None,
-        *,
-        at_ns: int | None = None,
-        fill: Fill = "far",
-        max_age_s: float = 0.5,
-    ) -> DepthView | None:
-        """Show the newest result from another pose; see :meth:`DepthSession.depth_at`."""
-        return self._session.depth_at(
-            world_from_view, view, at_ns=at_ns, fill=fill, max_age_s=max_age_s
-        )
 
     def submit(
         self,
@@ -188,7 +165,8 @@ class BlockingSession:
         world_from_left
             The left camera's pose at mid-exposure; None: not known.
         capture_ns
-            ``time.monotonic_ns()`` at mid-exposure; default: now.
+            ``time.monotonic_ns()`` at mid-exposure; default: now. Another clock in nanoseconds
+            will do; then the ages of results are NaN.
         max_age_s
             A frame that waits in the server for longer is dropped (``drops.stale``).
 
@@ -203,6 +181,8 @@ class BlockingSession:
             An image is not uint8, or has another shape than those above.
         BadPose
             The pose is not finite, or its rotation is not orthonormal with determinant +1.
+        BadShape
+            ``capture_ns`` is no whole number of 64 bits.
         WrongDelivery
             The session's delivery is EVERY, which must not drop frames; use :meth:`step`.
         NotOpen
@@ -236,7 +216,7 @@ class BlockingSession:
         BadPose
             The pose is not finite, or its rotation is not orthonormal with determinant +1.
         BadShape
-            The images do not have the rig's size.
+            The images do not have the rig's size, or ``capture_ns`` is no whole number.
         FrameTooLarge
             The frame has more bytes than the server accepts.
         FrameStale
@@ -269,7 +249,7 @@ class BlockingSession:
     def end(self) -> None:
         """Announce that no frame follows; iteration stops after the last answer.
 
-        Leaving ``async with`` does this too. A second call does nothing.
+        Leaving the ``with`` block does this too. A second call does nothing.
 
         Raises
         ------
@@ -288,41 +268,6 @@ class BlockingSession:
             return self._loop.wait(self._session.__anext__())
         except StopAsyncIteration:
             raise StopIteration from None
-
-    @property
-    def stream_id(self) -> str:
-        """The id of the stream on the server."""
-        return self._session.stream_id
-
-    @property
-    def resume_token(self) -> bytes:
-        """The secret with which another session can take this stream over, by its stream id."""
-        return self._session.resume_token
-
-    @property
-    def rig(self) -> RectifiedRig:
-        """The rig of every result: the one of ``open_session``, or its rectification."""
-        return self._session.rig
-
-    @property
-    def model(self) -> ModelInfo:
-        """The model that steps this stream."""
-        return self._session.model
-
-    @property
-    def credit(self) -> int:
-        """The number of frames that may be unanswered at once."""
-        return self._session.credit
-
-    @property
-    def drops(self) -> Drops:
-        """The frames that never became a result, until now."""
-        return self._session.drops
-
-    @property
-    def round_trip_s(self) -> float | None:
-        """Network time in seconds, there and back, of the latest ping; None before the first."""
-        return self._session.round_trip_s
 
 
 class BlockingClient:
@@ -397,8 +342,8 @@ class BlockingClient:
         iterations, cold_iterations
             Refinement iterations of a warm step and of a cold start; 0: the server's defaults.
         weights_sha256
-            The weights that results must come from (:attr:`ModelInfo.weights_sha256`); default:
-            any. Without them, a session goes on with a cold start if the server's change.
+            The weights that results must come from (:attr:`vergence.ModelInfo.weights_sha256`);
+            default: any. Without them, a session goes on with a cold start if the server's change.
         encoding
             The format of images on the wire: RAW is exact and large, PNG is exact and slow.
         jpeg_quality

@@ -7,7 +7,7 @@ import time
 
 from vergence_proto.errors import BadShape
 
-log = logging.getLogger("vergence")
+log: logging.Logger = logging.getLogger("vergence")
 
 _INT64 = range(-(2**63), 2**63)
 # A time of another clock is off by years, or by the time since the machine was started.

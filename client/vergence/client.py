@@ -9,7 +9,8 @@ from vergence.errors import NotOpen
 from vergence.info import ServerInfo, StreamInfo
 from vergence.info_codec import server_info_from_proto, stream_info_from_proto
 from vergence.results import SessionEvent
-from vergence.session import DepthSession, SessionSetup
+from vergence.session import DepthSession
+from vergence.session_facts import SessionSetup
 from vergence.transports.addresses import DEFAULT_SERVER, connector, on_this_machine
 from vergence.transports.base import Transport
 from vergence.units import warn_of_baseline

@@ -26,7 +26,7 @@ class ResponseRouter:
     rig: RectifiedRig
 
     def __init__(self, in_flight: FramesInFlight, axes: Axes) -> None:
-        self.recent = RecentResults()
+        self.recent: RecentResults = RecentResults()
         self.opened: pb.StreamOpened | None = None  # None: the stream was never open
         self.error: Exception | None = None  # the error that ended the stream
         self.reset_after: int | None = None  # the last frame before a reset not yet confirmed

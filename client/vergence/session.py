@@ -2,46 +2,26 @@
 
 import asyncio
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vergence.attaching import RecoveryRules
 from vergence.capture_clock import CaptureClock
-from vergence.connection import RESET, StreamConnection
+from vergence.connection import RESET
 from vergence.errors import NotOpen, WrongDelivery
-from vergence.in_flight import FrameInFlight, FramesInFlight
-from vergence.info import ModelInfo
-from vergence.info_codec import model_info_from_proto
-from vergence.reprojection import DepthView, Fill, View
-from vergence.responses import ResponseRouter
-from vergence.results import DepthResult, Drops, NotSent, SessionEvent, SessionState
-from vergence.transports.base import Transport
+from vergence.in_flight import FrameInFlight
+from vergence.results import DepthResult, NotSent, SessionState
+from vergence.session_facts import SessionFacts, SessionParts, SessionSetup
 from vergence_proto import codec
-from vergence_proto.geometry import Matrix, Pose, RectifiedRig
-from vergence_proto.types import Delivery, ImageEncoding, PoseSample, StereoFrame
-from vergence_proto.v1 import depth_pb2 as pb
+from vergence_proto.geometry import Matrix, Pose
+from vergence_proto.types import Delivery, PoseSample, StereoFrame
 
 WorldFromLeft = Pose | PoseSample | Matrix | Sequence[Sequence[float]] | None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SessionSetup:
-    """The choices of :meth:`vergence.DepthClient.open_session`, which alone makes sessions."""
-
-    transport: Transport
-    opening: pb.OpenStream
-    delivery: Delivery
-    encoding: ImageEncoding
-    jpeg_quality: int
-    on_event: Callable[[SessionEvent], None] | None
-    rules: RecoveryRules
-
-
-class DepthSession:
+class DepthSession(SessionFacts):
     """One stereo stream. :meth:`vergence.DepthClient.open_session` makes it; use ``async with``.
 
     There are two ways to use a session. Request and response, where no frame is dropped::
@@ -76,12 +56,7 @@ class DepthSession:
     _left_open = False
 
     def __init__(self, setup: SessionSetup, /) -> None:
-        self._setup = setup
-        self._in_flight = FramesInFlight()
-        self._responses = ResponseRouter(self._in_flight, codec.axes_from_proto(setup.opening.axes))
-        self._connection = StreamConnection(
-            setup.transport, setup.opening, self._responses, setup.on_event, setup.rules
-        )
+        super().__init__(SessionParts.of(setup))
         self._clock = CaptureClock(live=setup.delivery is Delivery.NEWEST)
         self._turn = asyncio.Lock()
         self._next_id = 1
@@ -115,17 +90,17 @@ class DepthSession:
         NotOpen
             The session was open before; a session opens once.
         """
-        if self._responses.opened is not None:
+        if self._parts.responses.opened is not None:
             raise NotOpen("this session was opened before; make a new one with open_session()")
-        await self._connection.open()
+        await self._parts.connection.open()
         self._left_open = True
-        self._next_id = self._opened().last_frame_id + 1
+        self._next_id = self._parts.opened().last_frame_id + 1
         return self
 
     async def __aexit__(self, *exc_info: object) -> None:
         """End the stream; the server frees its state."""
         self._left_open = False
-        await self._connection.close()
+        await self._parts.connection.close()
 
     def __del__(self) -> None:
         """Warn if nobody has left the ``async with`` (or ``with``) of this session."""
@@ -136,99 +111,6 @@ class DepthSession:
                 stacklevel=2,
                 source=self,
             )
-
-    @property
-    def stream_id(self) -> str:
-        """The id of the stream on the server."""
-        return self._setup.opening.stream_id
-
-    @property
-    def resume_token(self) -> bytes:
-        """The secret with which another session can take this stream over, by its stream id."""
-        return self._opened().resume_token
-
-    @property
-    def rig(self) -> RectifiedRig:
-        """The rig of every result: the one of ``open_session``, or its rectification."""
-        self._opened()
-        return self._responses.rig
-
-    @property
-    def model(self) -> ModelInfo:
-        """The model that steps this stream."""
-        return model_info_from_proto(self._opened().model)
-
-    @property
-    def credit(self) -> int:
-        """The number of frames that may be unanswered at once."""
-        self._opened()
-        return self._in_flight.credit
-
-    @property
-    def drops(self) -> Drops:
-        """The frames that never became a result, until now."""
-        return self._in_flight.drops
-
-    @property
-    def round_trip_s(self) -> float | None:
-        """Network time in seconds, there and back, of the latest ping; None before the first."""
-        return self._connection.round_trip_s
-
-    @property
-    def state(self) -> SessionState:
-        """The state of the connection; silence shows after 1 s, or three round trips."""
-        self._opened()
-        return self._connection.state
-
-    @property
-    def latest(self) -> DepthResult | None:
-        """The newest result so far; None before the first. Any thread may read it, at any time."""
-        return self._responses.recent.latest
-
-    def depth_at(
-        self,
-        world_from_view: Pose | PoseSample | Matrix,
-        view: View | None = None,
-        *,
-        at_ns: int | None = None,
-        fill: Fill = "far",
-        max_age_s: float = 0.5,
-    ) -> DepthView | None:
-        """Show the newest result from another pose, such as an eye's at display time.
-
-        Any thread may call it; it never waits for the network, and takes a few milliseconds. An
-        earlier result fills what the newest one does not see; see :func:`vergence.reproject`.
-
-        Parameters
-        ----------
-        world_from_view
-            The pose to see from, in the session's axes and metres; a matrix is [3, 4] or [4, 4].
-        view
-            The camera to see with; default: the rectified left camera.
-        at_ns
-            The time to show, on the clock of ``capture_ns``; default: now.
-        fill
-            What to give pixels that no result saw: ``"far"`` or ``"none"``.
-        max_age_s
-            The greatest age of the newest result, in seconds.
-
-        Returns
-        -------
-        DepthView | None
-            None if there is no result of at most that age.
-
-        Raises
-        ------
-        BadPose
-            The pose is not finite or no rigid transform, or the frames were sent without poses.
-        """
-        if isinstance(world_from_view, np.ndarray):
-            world_from_view = Pose.from_matrix(world_from_view)
-        elif isinstance(world_from_view, PoseSample):
-            world_from_view = world_from_view.world_from_left
-        return self._responses.recent.depth_at(
-            world_from_view, view, at_ns=at_ns, fill=fill, max_age_s=max_age_s
-        )
 
     def submit(
         self,
@@ -273,15 +155,15 @@ class DepthSession:
         DepthError
             The error that ended the stream, such as Superseded.
         """
-        self._opened()
-        if self._setup.delivery is Delivery.EVERY:
+        self._parts.opened()
+        if self._parts.setup.delivery is Delivery.EVERY:
             raise WrongDelivery("submit() may drop frames and this session is lossless: use step()")
         self._check_open()
-        if self._connection.state is not SessionState.LIVE:
-            self._in_flight.count(offline=1)
+        if self._parts.connection.state is not SessionState.LIVE:
+            self._parts.in_flight.count(offline=1)
             return NotSent.OFFLINE
-        if not self._in_flight.has_room:
-            self._in_flight.count(at_source=1)
+        if not self._parts.in_flight.has_room:
+            self._parts.in_flight.count(at_source=1)
             return NotSent.CREDIT
         request = self._request(left, right, world_from_left, capture_ns, max_age_s)
         return self._send(request, answer=None)
@@ -320,10 +202,10 @@ class DepthSession:
         DepthError
             The error that ended the stream, such as Superseded.
         """
-        self._opened()
+        self._parts.opened()
         answer: asyncio.Future[DepthResult] = asyncio.get_running_loop().create_future()
         async with self._turn:
-            await self._in_flight.wait_for_room()
+            await self._parts.in_flight.wait_for_room()
             self._check_open()
             request = self._request(left, right, world_from_left, capture_ns, max_age_s=None)
             self._send(request, answer)
@@ -340,21 +222,21 @@ class DepthSession:
             The error that ended the stream.
         """
         self._check_open()
-        self._responses.reset_after = self._next_id - 1
-        self._connection.send(RESET)
+        self._parts.responses.reset_after = self._next_id - 1
+        self._parts.connection.send(RESET)
 
     def end(self) -> None:
         """Announce that no frame follows; iteration stops after the last answer.
 
-        Leaving ``async with`` does this too. A second call does nothing.
+        Leaving the ``with`` block does this too. A second call does nothing.
 
         Raises
         ------
         NotOpen
             The session was never open.
         """
-        self._opened()
-        self._connection.end()
+        self._parts.opened()
+        self._parts.connection.end()
 
     def __aiter__(self) -> Self:
         """Iterate over the results of submitted frames."""
@@ -377,21 +259,14 @@ class DepthSession:
         NotOpen
             The session was never open.
         """
-        self._opened()
-        return await self._responses.next()
-
-    def _opened(self) -> pb.StreamOpened:
-        if self._responses.opened is None:
-            raise NotOpen(
-                "the session is not open; write: async with client.open_session(rig) as session"
-            )
-        return self._responses.opened
+        self._parts.opened()
+        return await self._parts.responses.next()
 
     def _check_open(self) -> None:
-        self._opened()
-        if self._responses.error is not None:
-            raise self._responses.error
-        if self._connection.ending:
+        self._parts.opened()
+        if self._parts.responses.error is not None:
+            raise self._parts.responses.error
+        if self._parts.connection.ending:
             raise NotOpen("the session has ended; open a new one with client.open_session()")
 
     def _request(
@@ -410,13 +285,13 @@ class DepthSession:
         frame = StereoFrame(self._next_id, capture_ns, left, right, world_from_left)
         return codec.frame_to_request(
             frame,
-            encoding=self._setup.encoding,
-            jpeg_quality=self._setup.jpeg_quality,
+            encoding=self._parts.setup.encoding,
+            jpeg_quality=self._parts.setup.jpeg_quality,
             max_age_s=max_age_s,
         )
 
     def _send(self, request: bytes, answer: asyncio.Future[DepthResult] | None) -> int:
         frame_id, self._next_id = self._next_id, self._next_id + 1
-        self._in_flight.add(FrameInFlight(frame_id, request, answer))
-        self._connection.send(request)
+        self._parts.in_flight.add(FrameInFlight(frame_id, request, answer))
+        self._parts.connection.send(request)
         return frame_id

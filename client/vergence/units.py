@@ -7,7 +7,7 @@ import numpy as np
 from vergence_proto.geometry import RectifiedRig
 from vergence_proto.types import StereoRig
 
-log = logging.getLogger("vergence")
+log: logging.Logger = logging.getLogger("vergence")
 
 # Longer ones exist, between aeroplanes and satellites; a hundred millimetres read as metres are
 # the usual mistake.

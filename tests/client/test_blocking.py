@@ -171,3 +171,16 @@ def test_a_process_forked_after_a_client_was_opened_is_told_so(server: str) -> N
     assert old.startswith("NotOpen: this process was forked")
     assert after == new
     assert "'spawn'" in new
+
+
+def test_twins_say_the_same() -> None:
+    """What is written twice, for editors, is the same text."""
+    twins: list[tuple[type, type, str]] = [
+        *((BlockingClient, DepthClient, name) for name in ("server_info", "stream_info")),
+        (BlockingClient, DepthClient, "close_stream"),
+        *((BlockingSession, DepthSession, name) for name in ("submit", "step", "reset", "end")),
+    ]
+    for blocking, asynchronous, name in twins:
+        text = inspect.getdoc(getattr(asynchronous, name))
+        assert text, name
+        assert inspect.getdoc(getattr(blocking, name)) == text, name

@@ -1,0 +1,162 @@
+"""What a session knows of its stream, the same for asynchronous and blocking callers."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from vergence.attaching import RecoveryRules
+from vergence.connection import StreamConnection
+from vergence.errors import NotOpen
+from vergence.in_flight import FramesInFlight
+from vergence.info import ModelInfo
+from vergence.info_codec import model_info_from_proto
+from vergence.reprojection import DepthView, Fill, View
+from vergence.responses import ResponseRouter
+from vergence.results import DepthResult, Drops, SessionEvent, SessionState
+from vergence.transports.base import Transport
+from vergence_proto import codec
+from vergence_proto.geometry import Matrix, Pose, RectifiedRig
+from vergence_proto.types import Delivery, ImageEncoding, PoseSample
+from vergence_proto.v1 import depth_pb2 as pb
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SessionSetup:
+    """The choices of :meth:`vergence.DepthClient.open_session`, which alone makes sessions."""
+
+    transport: Transport
+    opening: pb.OpenStream
+    delivery: Delivery
+    encoding: ImageEncoding
+    jpeg_quality: int
+    on_event: Callable[[SessionEvent], None] | None
+    rules: RecoveryRules
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SessionParts:
+    """The parts that a session is made of."""
+
+    setup: SessionSetup
+    in_flight: FramesInFlight
+    responses: ResponseRouter
+    connection: StreamConnection
+
+    @classmethod
+    def of(cls, setup: SessionSetup) -> Self:
+        in_flight = FramesInFlight()
+        responses = ResponseRouter(in_flight, codec.axes_from_proto(setup.opening.axes))
+        connection = StreamConnection(
+            setup.transport, setup.opening, responses, setup.on_event, setup.rules
+        )
+        return cls(setup, in_flight, responses, connection)
+
+    def opened(self) -> pb.StreamOpened:
+        """Return how the server opened the stream. Raises NotOpen: it did not yet."""
+        if self.responses.opened is None:
+            raise NotOpen(
+                "the session is not open; write: async with client.open_session(rig) as session"
+            )
+        return self.responses.opened
+
+
+class SessionFacts:
+    """What can be read of a session, in any thread and at any time after it was opened."""
+
+    def __init__(self, parts: SessionParts, /) -> None:
+        self._parts = parts
+
+    @property
+    def stream_id(self) -> str:
+        """The id of the stream on the server."""
+        return self._parts.setup.opening.stream_id
+
+    @property
+    def resume_token(self) -> bytes:
+        """The secret with which another session can take this stream over, by its stream id."""
+        return self._parts.opened().resume_token
+
+    @property
+    def rig(self) -> RectifiedRig:
+        """The rig of every result: the one of ``open_session``, or its rectification."""
+        self._parts.opened()
+        return self._parts.responses.rig
+
+    @property
+    def model(self) -> ModelInfo:
+        """The model that steps this stream."""
+        return model_info_from_proto(self._parts.opened().model)
+
+    @property
+    def credit(self) -> int:
+        """The number of frames that may be unanswered at once."""
+        self._parts.opened()
+        return self._parts.in_flight.credit
+
+    @property
+    def drops(self) -> Drops:
+        """The frames that never became a result, until now."""
+        return self._parts.in_flight.drops
+
+    @property
+    def round_trip_s(self) -> float | None:
+        """Network time in seconds, there and back, of the latest ping; None before the first."""
+        return self._parts.connection.round_trip_s
+
+    @property
+    def state(self) -> SessionState:
+        """The state of the connection; silence shows after 1 s, or three round trips."""
+        self._parts.opened()
+        return self._parts.connection.state
+
+    @property
+    def latest(self) -> DepthResult | None:
+        """The newest result so far; None before the first. Any thread may read it, at any time."""
+        return self._parts.responses.recent.latest
+
+    def depth_at(
+        self,
+        world_from_view: Pose | PoseSample | Matrix,
+        view: View | None = None,
+        *,
+        at_ns: int | None = None,
+        fill: Fill = "far",
+        max_age_s: float = 0.5,
+    ) -> DepthView | None:
+        """Show the newest result from another pose, such as an eye's at display time.
+
+        Any thread may call it; it never waits for the network, and takes a few milliseconds. An
+        earlier result fills what the newest one does not see; see :func:`vergence.reproject`.
+
+        Parameters
+        ----------
+        world_from_view
+            The pose to see from, in the session's axes and metres; a matrix is [3, 4] or [4, 4].
+        view
+            The camera to see with; default: the rectified left camera.
+        at_ns
+            The time to show, on the clock of ``capture_ns``; default: now.
+        fill
+            What to give pixels that no result saw: ``"far"`` or ``"none"``.
+        max_age_s
+            The greatest age of the newest result, in seconds.
+
+        Returns
+        -------
+        DepthView | None
+            None if there is no result of at most that age.
+
+        Raises
+        ------
+        BadPose
+            The pose is not finite or no rigid transform, or the frames were sent without poses.
+        """
+        if isinstance(world_from_view, np.ndarray):
+            world_from_view = Pose.from_matrix(world_from_view)
+        elif isinstance(world_from_view, PoseSample):
+            world_from_view = world_from_view.world_from_left
+        return self._parts.responses.recent.depth_at(
+            world_from_view, view, at_ns=at_ns, fill=fill, max_age_s=max_age_s
+        )
