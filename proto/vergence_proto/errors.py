@@ -12,6 +12,7 @@
     |-- ClientTimeout                                    the client sends too slowly
     |-- BadSequence, UploadTooLarge                      an uploaded sequence is refused
     |-- UnknownSequence, SequenceNotDone, QueueFull      the job or its result is not available
+    |-- InsufficientStorage                              the server's disk has no room
     |-- Draining, NotReady                               not now: try again, or on another server
     `-- ModelFailed, NonFinite                           the server's own failure
 
@@ -51,6 +52,7 @@ class ErrorCode(StrEnum):
     SEQUENCE_UNKNOWN = "SEQUENCE_UNKNOWN"
     SEQUENCE_NOT_DONE = "SEQUENCE_NOT_DONE"
     QUEUE_FULL = "QUEUE_FULL"
+    INSUFFICIENT_STORAGE = "INSUFFICIENT_STORAGE"
 
 
 ERROR_DOMAIN = "vergence"  # google.rpc.ErrorInfo.domain
@@ -217,6 +219,12 @@ class QueueFull(DepthError):
     """The queue of sequences is full, or the disk has no room for another sequence."""
 
     code = ErrorCode.QUEUE_FULL
+
+
+class InsufficientStorage(DepthError):
+    """The disk of the server is full, read-only or failing, or too small for the upload."""
+
+    code = ErrorCode.INSUFFICIENT_STORAGE
 
 
 ERROR_CLASSES: dict[ErrorCode, type[DepthError]] = {

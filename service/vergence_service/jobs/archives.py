@@ -13,17 +13,19 @@ import stat
 import tarfile
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from io import BufferedIOBase
 from pathlib import Path, PurePosixPath
 from typing import IO, cast
 
 from vergence_proto.datasets.listing import is_data
-from vergence_proto.errors import BadSequence, UploadTooLarge
+from vergence_proto.errors import BadSequence, InsufficientStorage, UploadTooLarge
+from vergence_service.jobs.storage import free_bytes
 
 _CHUNK = 1 << 20
 _LONGEST_NAME = 512
+_NAME_BYTES = 512  # what an empty file costs: the header of a tar, about an entry of a file system
 _LONGEST_PART_BYTES = 255  # limit of common file systems
 # A colon or a backslash is a character like any other, but not on Windows.
 _NOT_IN_NAMES = '\\/:*?"<>|\0' if os.name == "nt" else "\0"
@@ -72,15 +74,15 @@ def unpacking(archive: Path, folder: Path, limits: ArchiveLimits) -> Iterator[No
 
     Raises BadSequence if the file is not a zip or tar archive, is damaged or encrypted, or contains
     links or names that lead out of the folder. Raises UploadTooLarge if it has more files, bytes or
-    compression than ``limits`` allow.
+    compression than ``limits`` allow, and InsufficientStorage if the disk has no room for it.
     """
     with archive.open("rb") as file:
         start = file.read(8)
     allowed = min(limits.max_unpacked_bytes, round(limits.max_ratio * archive.stat().st_size))
-    budget = _Budget(limits, allowed)
+    budget = _Budget(limits, allowed, free_bytes(folder))
     members = _zip_members if start.startswith(_ZIP_START) else _tar_members
     try:
-        for member in members(archive, start):
+        for member in members(archive, start, budget):
             budget.take_file(member)
             path = _target_path(folder, member.name)
             if all(map(is_data, path.relative_to(folder).parts)):
@@ -92,26 +94,41 @@ def unpacking(archive: Path, folder: Path, limits: ArchiveLimits) -> Iterator[No
 class _Budget:
     """Counts files and bytes against the limits."""
 
-    def __init__(self, limits: ArchiveLimits, allowed_bytes: int) -> None:
+    def __init__(self, limits: ArchiveLimits, allowed_bytes: int, free_bytes: int) -> None:
         self._limits = limits
+        self._free_bytes = free_bytes
         self._files = 0
         self._bytes = 0
         self._allowed_bytes = allowed_bytes
 
     def take_file(self, member: _Member) -> None:
         self._files += 1
-        if self._files > self._limits.max_files:
+        self._bytes += _NAME_BYTES
+        self.check_files(self._files)
+        self._check(self._bytes + member.declared_bytes)
+
+    def check_all(self, members: Sequence[_Member]) -> None:
+        """Check all members at once, where an archive lists them, before any is written."""
+        self.check_files(len(members))
+        self._check(sum(_NAME_BYTES + member.declared_bytes for member in members))
+
+    def check_files(self, count: int) -> None:
+        if count > self._limits.max_files:
             raise UploadTooLarge(
                 f"expected at most {self._limits.max_files} files in the archive; the server's "
                 "setting batch.max_files allows more"
             )
-        self._check(self._bytes + member.declared_bytes)
 
     def take_bytes(self, count: int) -> None:
         self._bytes += count
         self._check(self._bytes)
 
     def _check(self, count: int) -> None:
+        if count > self._free_bytes:
+            raise InsufficientStorage(
+                f"the archive needs {count} bytes or more on the disk, and {self._free_bytes} are "
+                "free; delete results, or make room on the server"
+            )
         if count > self._allowed_bytes:
             raise UploadTooLarge(
                 f"the archive unpacks to more than {self._allowed_bytes} bytes; the limit "
@@ -148,27 +165,33 @@ def _writing(member: _Member, path: Path, budget: _Budget) -> Iterator[None]:
         raise BadSequence(f"the archive contains {member.name!r} twice") from None
 
 
-def _zip_members(archive: Path, start: bytes) -> Iterator[_Member]:
+def _zip_members(archive: Path, start: bytes, budget: _Budget) -> Iterator[_Member]:
     with zipfile.ZipFile(archive) as file:
-        # Some tools of Windows write backslashes where the format says slashes.
-        windows = not any("/" in info.filename for info in file.infolist())
-        for info in file.infolist():
-            name = info.filename.replace("\\", "/") if windows else info.filename
-            if name.endswith("/"):
-                continue
-            kind = stat.S_IFMT(info.external_attr >> 16)
-            if kind not in (0, stat.S_IFREG):
-                raise BadSequence(f"expected files and folders only, {info.filename!r} is a link")
-            if info.flag_bits & 1:
-                raise BadSequence(f"expected an archive without a password: {info.filename!r}")
-            yield _Member(name, info.file_size, _opener(file, info))
+        listed = list(_listed(file))
+        budget.check_all(listed)
+        yield from listed
+
+
+def _listed(file: zipfile.ZipFile) -> Iterator[_Member]:
+    # Some tools of Windows write backslashes where the format says slashes.
+    windows = not any("/" in info.filename for info in file.infolist())
+    for info in file.infolist():
+        name = info.filename.replace("\\", "/") if windows else info.filename
+        if name.endswith("/"):
+            continue
+        kind = stat.S_IFMT(info.external_attr >> 16)
+        if kind not in (0, stat.S_IFREG):
+            raise BadSequence(f"expected files and folders only, {info.filename!r} is a link")
+        if info.flag_bits & 1:
+            raise BadSequence(f"expected an archive without a password: {info.filename!r}")
+        yield _Member(name, info.file_size, _opener(file, info))
 
 
 def _opener(file: zipfile.ZipFile, info: zipfile.ZipInfo) -> Callable[[], IO[bytes]]:
     return lambda: file.open(info)
 
 
-def _tar_members(archive: Path, start: bytes) -> Iterator[_Member]:
+def _tar_members(archive: Path, start: bytes, budget: _Budget) -> Iterator[_Member]:
     opened = next(
         (
             decompressor(archive)

@@ -16,6 +16,8 @@ from vergence_proto.accuracy import Accuracy
 from vergence_service.inference.model import RecurrentState
 from vergence_service.inference.snapshots import state_from_bytes, state_to_bytes
 
+_LONGEST_LINE = 64 << 20  # it lists the accuracy of every frame
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Checkpoint:
@@ -41,6 +43,15 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     unfinished = path.with_suffix(".new")
     unfinished.write_bytes(json.dumps(about).encode() + b"\n" + state_to_bytes(checkpoint.state))
     os.replace(unfinished, path)
+
+
+def saved_frames(path: Path) -> int:
+    """Return the number of frames of a checkpoint; 0 if it is missing or damaged."""
+    try:
+        with path.open("rb") as file:
+            return int(json.loads(file.readline(_LONGEST_LINE))["frames"])
+    except (OSError, KeyError, TypeError, ValueError):
+        return 0
 
 
 def read_checkpoint(path: Path) -> Checkpoint | None:

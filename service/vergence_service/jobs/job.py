@@ -29,14 +29,17 @@ class Job:
     client: str = ""  # address of the client that submitted it
     options: JobOptions = field(default_factory=JobOptions)
     state: JobState = JobState.QUEUED
-    attempts: int = 0  # runs that were started and not finished
+    attempts: int = 0  # runs that began at frame ``reached`` and were not finished
+    reached: int = 0  # frames that were done when the last run began
     finished_s: float | None = None  # Unix time of its end
+    finished_up_s: float | None = None  # the same, in seconds of the store's uptime
     fps: float | None = None
     disk_bytes: int = 0  # space reserved until the job ends, then space used
+    result_bytes: int = 0  # the share of it that its result needs
     accuracy: Mapping[str, float] | None = None
     frames_unread: int = 0  # frames without a result, because an image could not be read
     notes: tuple[str, ...] = ()  # what is missing in the upload or does not fit
-    reason: str | None = None  # ErrorCode of the failure
+    reason: str | None = None  # ErrorCode of the failure, or of what it waits for
     message: str | None = None
 
     @property

@@ -52,7 +52,7 @@ class JobQueue:
         self._store = store
         self._limits = limits
         self._worker = JobWorker(engine, self.jobs, checkpoint_s=limits.checkpoint_s)
-        self._uploading: list[str] = []  # the clients of the uploads in progress
+        self._accepting: list[str] = []  # the clients of the jobs that are being added
 
     async def __aenter__(self) -> Self:
         await self.jobs.load()
@@ -70,28 +70,26 @@ class JobQueue:
         await self._worker.stop()
 
     @asynccontextmanager
-    async def reserve_slot(self, client: str) -> AsyncIterator[Path]:
-        """Reserve a place in the queue, and provide a folder for an upload.
+    async def upload_folder(self, client: str, *, upload_bytes: int) -> AsyncIterator[Path]:
+        """Provide a folder for an upload of ``upload_bytes``; 0 if the size is not known.
 
         The folder is removed at the end of the block, unless :meth:`accept` has taken it.
         ``client`` is the address that the upload comes from.
 
-        Raises QueueFull, and Quota if the client has too many unfinished jobs.
+        Raises QueueFull, Quota and InsufficientStorage if :meth:`accept` would now. An upload takes
+        a place in the queue only when it is complete: a slow one keeps nobody out.
         """
         self._check_room(client)
-        self._uploading.append(client)
+        await self.jobs.check_free(upload_bytes, what="the upload")
+        folder = await self.threads.run(self._store.new_folder)
         try:
-            folder = await self.threads.run(self._store.new_folder)
-            try:
-                yield folder
-            finally:
-                await self.threads.run(remove_folder, folder)
+            yield folder
         finally:
-            self._uploading.remove(client)
+            await self.threads.run(remove_folder, folder)
 
     def _check_room(self, client: str) -> None:
         limits = self._limits
-        waiting = [*(job.client for job in self.jobs.unfinished()), *self._uploading]
+        waiting = [*(job.client for job in self.jobs.unfinished()), *self._accepting]
         if len(waiting) >= limits.waiting:
             raise QueueFull(
                 f"{limits.waiting} sequences are waiting, the limit of the queue; try again later "
@@ -113,9 +111,10 @@ class JobQueue:
 
         ``source`` is KIND:PATH; it is needed if the upload contains several sequences.
 
-        Raises BadSequence, BadCalibration or FrameTooLarge if the upload cannot be stepped,
-        UploadTooLarge or QueueFull if it does not fit on the disk, and NotReady or Draining if the
-        server accepts no work.
+        Raises BadSequence, BadCalibration or FrameTooLarge if the upload cannot be stepped;
+        UploadTooLarge, QueueFull or InsufficientStorage if it does not fit on the disk; QueueFull,
+        and Quota if the client has too many unfinished jobs; and NotReady or Draining if the server
+        accepts no work.
         """
         await self.threads.finish(
             checking_folder(folder / "input", max_pixels=self._engine.max_pixels)
@@ -124,6 +123,7 @@ class JobQueue:
         # Refuse now what could not be opened when the job runs.
         await self._engine.check_offline(job_stream_config(sequence, options))
         uploaded = await self.threads.run(folder_bytes, folder)
+        result = result_bytes(sequence, options.outputs)
         job = Job(
             job_id=secrets.token_hex(8),
             source=chosen,
@@ -132,10 +132,16 @@ class JobQueue:
             created_s=time.time(),
             client=client,
             options=options,
-            disk_bytes=uploaded + result_bytes(sequence, options.outputs),
+            disk_bytes=uploaded + result,
+            result_bytes=result,
         )
-        await self.jobs.make_room(job.disk_bytes)
-        await self.jobs.add(folder, job)
+        self._check_room(client)
+        self._accepting.append(client)
+        try:
+            await self.jobs.make_room(job)
+            await self.jobs.add(folder, job)
+        finally:
+            self._accepting.remove(client)
         return self.jobs.status(job.job_id)
 
     async def delete(self, job_id: str) -> None:

@@ -3,15 +3,22 @@
 import asyncio
 import time
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
-from vergence_proto.errors import QueueFull, SequenceNotDone, UnknownSequence, UploadTooLarge
+from vergence_proto.errors import (
+    InsufficientStorage,
+    QueueFull,
+    SequenceNotDone,
+    UnknownSequence,
+    UploadTooLarge,
+)
 from vergence_proto.jobs import JobState
 from vergence_service.jobs.job import Job
 from vergence_service.jobs.progress import JobProgress, JobStatus
+from vergence_service.jobs.storage import check_free, disk_trouble, flushing
 from vergence_service.jobs.store import JobStore, folder_bytes
 from vergence_service.threads import ThreadPool, to_the_end
 
@@ -41,8 +48,11 @@ class JobRegistry:
 
     async def load(self) -> None:
         """Read the jobs of earlier servers."""
-        jobs = await self._background.run(self._store.load)
-        self._jobs = {job.job_id: job for job in jobs}
+        for job in await self._background.run(self._store.load):
+            if job.ended and job.finished_up_s is None:  # by a version without this field
+                job = replace(job, finished_up_s=self._store.uptime_s())
+                await self._background.run(self._store.update, job)
+            self._jobs[job.job_id] = job
 
     # Reading.
 
@@ -130,6 +140,7 @@ class JobRegistry:
         await to_the_end(self._add(folder, job))
 
     async def _add(self, folder: Path, job: Job) -> None:
+        await self._background.finish(flushing(folder))
         await self._background.run(self._store.insert, folder, job)
         self._jobs[job.job_id] = job
         await self._notify_changed()
@@ -143,9 +154,10 @@ class JobRegistry:
         """Record that the model is free again."""
         self._last_job_s = self._running[job_id].elapsed_s
 
-    def end_run(self, job_id: str) -> None:
-        """Record that the worker does nothing more for a job."""
+    async def end_run(self, job_id: str) -> None:
+        """Record that the worker does nothing more for a job, or begins with it again."""
         del self._running[job_id]
+        await self._notify_changed()
 
     async def update(self, job: Job) -> None:
         """Replace the entry of a job, unless it was deleted."""
@@ -154,13 +166,38 @@ class JobRegistry:
             self._jobs[job.job_id] = job
             await self._notify_changed()
 
-    async def finish(self, job: Job) -> None:
-        """Record that a job has ended, and remove the files that it needs no more."""
-        result = self._store.folder(job.job_id) / "result"
-        done = job.state is JobState.DONE
-        used = await self._background.run(folder_bytes, result) if done else 0
-        job = replace(job, finished_s=time.time(), disk_bytes=used)
-        await self.update(job)
+    async def keep_waiting(self, job: Job) -> None:
+        """Record why a job waits: here, and on the disk if it can be written."""
+        if job.job_id in self._jobs:
+            self._jobs[job.job_id] = job
+            await self._notify_changed()
+        try:
+            await self._background.run(self._store.update, job)
+        except Exception as error:
+            if disk_trouble(error) is None:
+                raise
+
+    async def finish(self, job: Job, *, on_kept: Callable[[], None]) -> None:
+        """Record that a job has ended, and remove the files that it needs no more.
+
+        ``on_kept`` is called when the end is on the disk, before anybody sees it here.
+        """
+        used = 0
+        if job.state is JobState.DONE:
+            result = self._store.folder(job.job_id) / "result"
+            await self._background.finish(flushing(result))
+            used = await self._background.run(folder_bytes, result)
+        job = replace(
+            job,
+            finished_s=time.time(),
+            finished_up_s=self._store.uptime_s(),
+            disk_bytes=used,
+        )
+        await self._background.run(self._store.update, job)
+        on_kept()
+        if job.job_id in self._jobs:
+            self._jobs[job.job_id] = job
+            await self._notify_changed()
         # Only now: a server that is killed before the row is written needs the input again.
         await self._background.run(self._store.tidy, job)
 
@@ -182,34 +219,65 @@ class JobRegistry:
         return sum(job.disk_bytes for job in self._jobs.values())
 
     async def expire(self) -> None:
-        """Delete the jobs that ended too long ago."""
-        before_s = time.time() - self._keep_s
+        """Delete the jobs that ended too long ago, by the time that servers have run since.
+
+        The wall clock does not decide: it may jump by years when a machine starts.
+        """
+        await self._background.run(self._store.note_uptime)
+        before_s = self._store.uptime_s() - self._keep_s
         for job in self._removable():
-            if (job.finished_s or 0) < before_s:
+            if _ended_up_s(job) < before_s:
                 await self.delete(job.job_id)
 
-    async def make_room(self, needed_bytes: int) -> None:
+    def promised_bytes(self) -> int:
+        """Return the disk space that the results of unfinished jobs still need."""
+        return sum(
+            job.result_bytes - job.result_bytes * self._frames_done(job) // max(job.frames, 1)
+            for job in self.unfinished()
+        )
+
+    def _frames_done(self, job: Job) -> int:
+        progress = self._running.get(job.job_id)
+        return job.reached if progress is None else progress.frames_done
+
+    async def check_free(self, needed_bytes: int, *, what: str) -> None:
+        """Raise InsufficientStorage unless the disk has room for ``needed_bytes`` more."""
+        await self._background.run(
+            check_free,
+            self._store.directory,
+            needed_bytes,
+            promised_bytes=self.promised_bytes(),
+            what=what,
+        )
+
+    async def make_room(self, new: Job) -> None:
         """Delete the oldest results until a new job fits.
 
-        Raises UploadTooLarge if the job can never fit, and QueueFull if it does not fit now.
+        Its upload is on the disk already. Raises UploadTooLarge if the job can never fit, QueueFull
+        if it does not fit now, and InsufficientStorage if the disk has no room for its result.
         """
-        if needed_bytes > self._disk_bytes:
+        needed = new.disk_bytes
+        if needed > self._disk_bytes:
             raise UploadTooLarge(
-                f"the sequence and its result need {needed_bytes} bytes, the server keeps "
+                f"the sequence and its result need {needed} bytes, the server keeps "
                 f"{self._disk_bytes} for all sequences; send it in parts, or start the server with "
                 "a larger batch.disk_mib"
             )
-        for job in sorted(self._removable(), key=lambda job: job.finished_s or 0):
-            if self.used_bytes() + needed_bytes <= self._disk_bytes:
-                return
+        what = "the result of the sequence"
+        for job in sorted(self._removable(), key=_ended_up_s):
+            if self.used_bytes() + needed <= self._disk_bytes:
+                with suppress(InsufficientStorage):
+                    await self.check_free(new.result_bytes, what=what)
+                    return
             await self.delete(job.job_id)
-        if self.used_bytes() + needed_bytes > self._disk_bytes:
+        if self.used_bytes() + needed > self._disk_bytes:
             raise QueueFull(
                 f"the waiting sequences use {self.used_bytes()} of {self._disk_bytes} bytes on "
-                f"disk, this one needs {needed_bytes}; try again later (the server's setting "
+                f"disk, this one needs {needed}; try again later (the server's setting "
                 "batch.disk_mib)",
                 retry_after_s=self.usual_job_s(),
             )
+        await self.check_free(new.result_bytes, what=what)
 
     def _removable(self) -> list[Job]:
         return [job for job in self._jobs.values() if job.ended and not self._readers[job.job_id]]
@@ -217,3 +285,7 @@ class JobRegistry:
     async def _notify_changed(self) -> None:
         async with self._changed:
             self._changed.notify_all()
+
+
+def _ended_up_s(job: Job) -> float:
+    return job.finished_up_s or 0.0

@@ -83,22 +83,25 @@ def result_bytes(sequence: StereoSource, outputs: Collection[Output]) -> int:
     return len(sequence) * pixels * bytes_a_pixel
 
 
-def holds_frames(folder: Path, count: int, *, without: Collection[int] = ()) -> bool:
-    """Check that the first ``count`` files are complete; a crash may have cut off the last.
+def checking_frames(folder: Path, count: int, *, without: Collection[int] = ()) -> Iterator[bool]:
+    """Yield for each of the first ``count`` files, and for the rig, if it is complete.
 
-    Frames of the indices ``without`` may have no file.
+    A crash may have cut off the last ones. Nothing follows the first that is not complete. Frames
+    of the indices ``without`` may have no file.
     """
     try:
         RectifiedRig(**json.loads((folder / _RIG).read_text("utf-8")))
+        yield True
         for index in range(count):
             if index in without and not (folder / f"{index:06d}.npz").exists():
                 continue
             with zipfile.ZipFile(folder / f"{index:06d}.npz") as file:
-                if file.testzip() is not None:
-                    return False
+                complete = file.testzip() is None
+            yield complete
+            if not complete:
+                return
     except (OSError, TypeError, ValueError, zipfile.BadZipFile):
-        return False
-    return True
+        yield False
 
 
 def count_frames(folder: Path) -> int:

@@ -1,6 +1,5 @@
 """Run one job: step its input to the last frame and write the result to disk."""
 
-import asyncio
 import time
 from collections.abc import AsyncGenerator, AsyncIterable
 from contextlib import aclosing, suppress
@@ -9,7 +8,7 @@ from pathlib import Path
 
 from vergence_proto.accuracy import Accuracy, accuracy
 from vergence_proto.datasets import DatasetError, StereoSource
-from vergence_proto.errors import BadSequence, Draining
+from vergence_proto.errors import BadSequence
 from vergence_proto.jobs import Output
 from vergence_proto.ordered import in_order
 from vergence_proto.types import Delivery, OutputFormat
@@ -17,20 +16,21 @@ from vergence_service.jobs.checkpoints import Checkpoint, read_checkpoint, write
 from vergence_service.jobs.job import Job, JobOptions
 from vergence_service.jobs.progress import JobProgress
 from vergence_service.jobs.results import (
+    checking_frames,
     count_frames,
-    holds_frames,
     start_result,
     write_frame,
 )
 from vergence_service.jobs.sources import open_below, relative_text, sequence_error
 from vergence_service.jobs.stepping import Stepped, step_all
+from vergence_service.jobs.storage import disk_trouble
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.stream import StreamConfig
 from vergence_service.threads import ThreadPool
 
 # Frames that are being written while the next ones are stepped.
 _UNWRITTEN = 2
-_CHECKPOINT = "checkpoint"
+CHECKPOINT = "checkpoint"
 _NAMED_AT_MOST = 20
 
 
@@ -75,12 +75,17 @@ async def run_job(
     if not job.options.metrics:
         sequence = sequence.without_truth()
     result = folder / "result"
-    before = await background.run(_usable_checkpoint, folder, engine.card.weights_sha256)
+    before = await _usable_checkpoint(folder, engine.card.weights_sha256, background)
+    if before is None:
+        # First of all: a checkpoint of other weights must not continue the frames of this run.
+        await background.run((folder / CHECKPOINT).unlink, missing_ok=True)
     start, state = (before.frames, before.state) if before else (0, None)
     measured = list(before.measured) if before else []
     unread = dict(before.unread) if before else {}
 
     def skip(index: int, error: DatasetError) -> None:
+        if disk_trouble(error) is not None:
+            raise error  # the file is there; later it can be read
         unread[index] = str(sequence_error(error, folder / "input"))
 
     progress.frames_found = progress.frames_done = start
@@ -98,7 +103,7 @@ async def run_job(
             tuple(measured),
             {index: why for index, why in unread.items() if index <= stepped.index},
         )
-        await background.run(write_checkpoint, folder / _CHECKPOINT, checkpoint)
+        await background.run(write_checkpoint, folder / CHECKPOINT, checkpoint)
 
     config = job_stream_config(sequence, job.options)
     try:
@@ -120,7 +125,7 @@ async def run_job(
                     await save(stepped)
                     unsaved = None
                     checkpoint_due_s = time.monotonic() + checkpoint_s
-    except (asyncio.CancelledError, Draining):
+    except BaseException:
         if unsaved is not None:
             with suppress(OSError):  # the next server continues from here, or from the last one
                 await save(unsaved)
@@ -147,13 +152,16 @@ async def _started(
         yield stepped
 
 
-def _usable_checkpoint(folder: Path, weights_sha256: str) -> Checkpoint | None:
+async def _usable_checkpoint(
+    folder: Path, weights_sha256: str, background: ThreadPool
+) -> Checkpoint | None:
     """Return the checkpoint to continue from: a result must come from one set of weights."""
-    checkpoint = read_checkpoint(folder / _CHECKPOINT)
+    checkpoint = await background.run(read_checkpoint, folder / CHECKPOINT)
     if checkpoint is None or checkpoint.weights_sha256 != weights_sha256:
         return None
-    whole = holds_frames(folder / "result", checkpoint.frames, without=checkpoint.unread)
-    return checkpoint if whole else None
+    checking = checking_frames(folder / "result", checkpoint.frames, without=checkpoint.unread)
+    complete = [each async for each in background.iterate(checking)]
+    return checkpoint if all(complete) else None
 
 
 def _write_and_measure(folder: Path, stepped: Stepped) -> Accuracy | None:

@@ -9,17 +9,18 @@
     DIRECTORY/jobs/ID/result      see :mod:`vergence_service.jobs.results`
 """
 
-import os
 import secrets
 import shutil
 import sqlite3
-import sys
 import threading
+import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Self
 
 from vergence_proto.jobs import JobState
 from vergence_service.jobs.job import Job, job_from_json, job_to_json
+from vergence_service.jobs.storage import flush_path
 
 
 class StoreUnavailable(OSError):
@@ -31,7 +32,7 @@ class StoreInUse(StoreUnavailable):
 
 
 # Columns for queries and for people. The JSON document contains the whole job.
-_TABLE = """
+_JOBS = """
 CREATE TABLE IF NOT EXISTS jobs (
     job_id TEXT PRIMARY KEY,
     state TEXT NOT NULL,
@@ -39,6 +40,8 @@ CREATE TABLE IF NOT EXISTS jobs (
     document TEXT NOT NULL
 ) STRICT
 """
+# One row: the time that all servers of this folder have run, together.
+_UPTIME = "CREATE TABLE IF NOT EXISTS uptime (seconds REAL NOT NULL) STRICT"
 
 
 class JobStore:
@@ -71,7 +74,13 @@ class JobStore:
             self._database.execute("PRAGMA journal_mode = WAL")
             # An accepted job survives a power cut.
             self._database.execute("PRAGMA synchronous = FULL")
-            self._database.execute(_TABLE)
+            self._database.execute(_JOBS)
+            self._database.execute(_UPTIME)
+            row = self._database.execute("SELECT seconds FROM uptime").fetchone()
+            if row is None:
+                self._database.execute("INSERT INTO uptime VALUES (0)")
+            self._uptime_before_s = row[0] if row else 0.0
+            self._opened_s = time.monotonic()
             self._clear_leftovers()
         except sqlite3.Error as error:
             self._database.close()
@@ -84,12 +93,32 @@ class JobStore:
         return self
 
     def __exit__(self, *exc_info: object) -> None:
+        with suppress(sqlite3.Error):
+            self.note_uptime()
         self._database.close()
+
+    @property
+    def directory(self) -> Path:
+        """The folder of the jobs."""
+        return self._directory
+
+    def uptime_s(self) -> float:
+        """Return the time that all servers of this folder have run, together.
+
+        Unlike the wall clock, which may be set to any time while a server runs or is off, it only
+        counts the time in which a result could be downloaded.
+        """
+        return self._uptime_before_s + time.monotonic() - self._opened_s
+
+    def note_uptime(self) -> None:
+        """Keep the uptime for the next server."""
+        with self._turn:
+            self._database.execute("UPDATE uptime SET seconds = ?", (self.uptime_s(),))
 
     def load(self) -> list[Job]:
         """Read all jobs, oldest first."""
         with self._turn:
-            rows = self._database.execute("SELECT document FROM jobs ORDER BY created_s").fetchall()
+            rows = self._database.execute("SELECT document FROM jobs ORDER BY rowid").fetchall()
         return [job_from_json(document) for (document,) in rows]
 
     def new_folder(self) -> Path:
@@ -99,9 +128,12 @@ class JobStore:
         return folder
 
     def insert(self, folder: Path, job: Job) -> None:
-        """Add a job and move its upload to its folder. A crash after this does not lose it."""
-        _flush()
+        """Add a job and move its upload to its folder. A crash after this does not lose it.
+
+        The files of the upload must be flushed before.
+        """
         folder.rename(self.folder(job.job_id))
+        flush_path(self._directory / "jobs")
         with self._turn:
             self._database.execute(
                 "INSERT INTO jobs VALUES (?, ?, ?, ?)",
@@ -109,9 +141,10 @@ class JobStore:
             )
 
     def update(self, job: Job) -> None:
-        """Replace the row of a job, unless it was deleted."""
-        if job.ended:
-            _flush()
+        """Replace the row of a job, unless it was deleted.
+
+        If the job has ended, its result must be flushed before.
+        """
         with self._turn:
             self._database.execute(
                 "UPDATE jobs SET state = ?, document = ? WHERE job_id = ?",
@@ -129,9 +162,10 @@ class JobStore:
         return self._directory / "jobs" / job_id
 
     def tidy(self, job: Job) -> None:
-        """Remove the files that an ended job does not need."""
+        """Remove the files that an ended job does not need; the next start tries again."""
         remove_folder(self.folder(job.job_id) / "input")
-        (self.folder(job.job_id) / "checkpoint").unlink(missing_ok=True)
+        with suppress(OSError):
+            (self.folder(job.job_id) / "checkpoint").unlink(missing_ok=True)
         if job.state is JobState.FAILED:
             remove_folder(self.folder(job.job_id) / "result")
 
@@ -145,12 +179,6 @@ class JobStore:
         orphans = (each for each in (self._directory / "jobs").iterdir() if each.name not in known)
         for folder in [*unfinished, *orphans]:
             remove_folder(folder)
-
-
-def _flush() -> None:
-    """Write all files to the disk, before the row that promises them."""
-    if sys.platform != "win32":
-        os.sync()
 
 
 def remove_folder(folder: Path) -> None:

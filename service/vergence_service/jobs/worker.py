@@ -5,21 +5,32 @@ import logging
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 
-from vergence_proto.errors import DepthError, Draining, ModelFailed, NotReady
+from vergence_proto.errors import (
+    DepthError,
+    Draining,
+    InsufficientStorage,
+    ModelFailed,
+    NotReady,
+    StateMemory,
+)
 from vergence_proto.jobs import JobState
+from vergence_service.failures import error_of
+from vergence_service.jobs.checkpoints import saved_frames
 from vergence_service.jobs.job import Job
 from vergence_service.jobs.progress import JobProgress
 from vergence_service.jobs.registry import JobRegistry
-from vergence_service.jobs.run import run_job
+from vergence_service.jobs.run import CHECKPOINT, run_job
+from vergence_service.jobs.storage import disk_trouble
 from vergence_service.streams.engine import DepthEngine
 
 log = logging.getLogger(__name__)
 
-# After this many crashes while the same job was running, fail the job: it probably causes them.
+# So many runs may begin at the same frame of a job and not be finished, because the server died or
+# the model failed. Then the job is failed: it probably causes that.
 _MAX_ATTEMPTS = 4
 _EXPIRE_EVERY_S = 30.0
-# Pause before trying again when the disk refused to write.
-_TROUBLE_PAUSE_S = 5.0
+# Pause before trying again when the disk refused to read or write.
+_TROUBLE_PAUSE_S = 1.0
 
 
 @dataclass(slots=True, eq=False)
@@ -94,41 +105,78 @@ class JobWorker:
             finally:
                 self._jobs.end_stepping(job.job_id)
                 run.stepped.set()
-            # Count first: clients must not see the end of the job before the metrics do.
-            self._count_ended(ended, run.progress)
-            await self._jobs.finish(ended)
+            if ended is not None:
+                # Clients must not see the end of the job before the metrics do.
+                counted = partial(self._count_ended, ended, run.progress)
+                await self._jobs.finish(ended, on_kept=counted)
         except (Draining, NotReady):
             self._leaving = True
-        except Exception:  # most likely a full disk: the job keeps its place
-            log.exception("the state of sequence %s could not be kept", job.job_id)
-            await asyncio.sleep(_TROUBLE_PAUSE_S)
+        except Exception as error:
+            await self._wait_out(job, error)
         finally:
-            self._jobs.end_run(job.job_id)
             del self._runs[job.job_id]
+            await self._jobs.end_run(job.job_id)
 
-    async def _stepped(self, job: Job, progress: JobProgress) -> Job:
-        """Step the frames of a job; return the job as it is after success or failure."""
-        if job.attempts >= _MAX_ATTEMPTS:
-            return _failed(
-                job, ModelFailed(f"the server died {job.attempts} times while it ran this sequence")
+    async def _wait_out(self, job: Job, error: Exception) -> None:
+        """Let a job wait whose run failed for no fault of its own.
+
+        It keeps its place and its input.
+        """
+        if (trouble := disk_trouble(error)) is None:
+            why = error_of(error, log, f"sequence {job.job_id}")
+        else:
+            why = InsufficientStorage(
+                f"{trouble} ({error}); the sequence waits, and continues by itself"
             )
-        started = replace(job, state=JobState.RUNNING, attempts=job.attempts + 1)
+            if job.message != str(why):
+                log.warning("sequence %s waits: %s", job.job_id, why)
+        await self._jobs.keep_waiting(
+            replace(job, state=JobState.QUEUED, reason=why.code, message=str(why))
+        )
+        await asyncio.sleep(_TROUBLE_PAUSE_S)
+
+    async def _stepped(self, job: Job, progress: JobProgress) -> Job | None:
+        """Step the frames of a job.
+
+        Returns the job as it is after success or failure, or None if it must be tried again.
+        """
+        folder = self._jobs.folder(job.job_id)
+        saved = await self._engine.threads.background.run(saved_frames, folder / CHECKPOINT)
+        attempts = job.attempts + 1 if saved == job.reached else 1
+        if attempts > _MAX_ATTEMPTS:
+            return _given_up(job)
+        started = replace(
+            job,
+            state=JobState.RUNNING,
+            attempts=attempts,
+            reached=saved,
+            reason=None,
+            message=None,
+        )
         await self._jobs.update(started)
+        # If the run before did not reach its first checkpoint, every frame of progress counts.
+        checkpoint_s = self._checkpoint_s if attempts == 1 else 0.0
 
         try:
-            folder = self._jobs.folder(job.job_id)
             found = await run_job(
-                self._engine, folder, started, progress, checkpoint_s=self._checkpoint_s
+                self._engine, folder, started, progress, checkpoint_s=checkpoint_s
             )
         except (Draining, NotReady, asyncio.CancelledError):
             # The sequence did not cause this: it keeps its place, for this server or the next.
-            await self._jobs.update(replace(job, state=JobState.QUEUED))
+            await self._jobs.keep_waiting(replace(job, state=JobState.QUEUED))
             raise
-        except DepthError as error:
-            return _failed(started, error)
-        except Exception:
-            log.exception("sequence %s failed with an unexpected error", job.job_id)
-            return _failed(started, ModelFailed("the server failed; its log has the reason"))
+        except Exception as error:
+            if disk_trouble(error) is not None:
+                raise
+            known = error_of(error, log, f"sequence {job.job_id}")
+            if isinstance(known, NotReady):  # the server has no file descriptors left
+                raise
+            if not isinstance(known, ModelFailed | StateMemory):
+                return _failed(started, known)
+            # It may have been the moment, and not the frame.
+            again = replace(_failed(started, known), state=JobState.QUEUED)
+            await self._jobs.update(again)
+            return None
         accuracy = None if found.accuracy is None else asdict(found.accuracy)
         return replace(
             started,
@@ -150,6 +198,13 @@ class JobWorker:
         while True:
             await self._jobs.expire()
             await asyncio.sleep(_EXPIRE_EVERY_S)
+
+
+def _given_up(job: Job) -> Job:
+    where = f"{job.attempts} times before frame {job.reached} of {job.frames} was done"
+    if job.reason is None:
+        return _failed(job, ModelFailed(f"the server died {where}"))
+    return _failed(job, ModelFailed(f"the model failed {where}: {job.message}"))
 
 
 def _failed(job: Job, error: DepthError) -> Job:

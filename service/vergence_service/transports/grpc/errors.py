@@ -43,6 +43,7 @@ GRPC_STATUS: Mapping[ErrorCode, grpc.StatusCode] = {
     ErrorCode.SEQUENCE_UNKNOWN: grpc.StatusCode.NOT_FOUND,
     ErrorCode.SEQUENCE_NOT_DONE: grpc.StatusCode.FAILED_PRECONDITION,
     ErrorCode.QUEUE_FULL: grpc.StatusCode.RESOURCE_EXHAUSTED,
+    ErrorCode.INSUFFICIENT_STORAGE: grpc.StatusCode.RESOURCE_EXHAUSTED,
 }
 
 

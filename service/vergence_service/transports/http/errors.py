@@ -3,6 +3,7 @@
 import http
 import logging
 import math
+import sqlite3
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,8 +13,9 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 
-from vergence_proto.errors import BadShape, DepthError, ErrorCode
+from vergence_proto.errors import BadShape, DepthError, ErrorCode, InsufficientStorage
 from vergence_service.failures import error_of
+from vergence_service.jobs.storage import disk_trouble
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +42,7 @@ HTTP_STATUS: Mapping[ErrorCode, int] = {
     ErrorCode.STATE_MEMORY: 429,
     ErrorCode.QUOTA: 429,
     ErrorCode.QUEUE_FULL: 429,
+    ErrorCode.INSUFFICIENT_STORAGE: 507,
     ErrorCode.FRAME_STALE: 504,
     ErrorCode.DRAINING: 503,
     ErrorCode.NOT_READY: 503,
@@ -106,6 +109,15 @@ def install_problems(app: FastAPI) -> None:
         title = http.HTTPStatus(error.status_code).phrase
         problem = Problem(title=title, status=error.status_code, detail=error.detail)
         return _response(problem, headers=error.headers)
+
+    @app.exception_handler(OSError)
+    @app.exception_handler(sqlite3.Error)
+    async def _disk(request: Request, error: Exception) -> JSONResponse:
+        trouble = disk_trouble(error)
+        if trouble is None:
+            return await _unforeseen(request, error)
+        log.warning("a request was refused, because %s: %s", trouble, error)
+        return _response(problem_of(InsufficientStorage(f"{trouble}; try again later")))
 
     @app.exception_handler(Exception)
     async def _unforeseen(request: Request, error: Exception) -> JSONResponse:

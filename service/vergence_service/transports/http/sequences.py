@@ -107,7 +107,9 @@ class SequenceJob(BaseModel):
         description="frames without a result, because an image is missing or damaged"
     )
     notes: list[str] = Field(description="what is missing in the upload or does not fit")
-    reason: ErrorCode | None = Field(description="code of the failure")
+    reason: ErrorCode | None = Field(
+        description="code of the failure, or of what the sequence waits for"
+    )
     message: str | None
 
     @classmethod
@@ -197,7 +199,8 @@ def sequence_routes(
             metrics=query.metrics,
         )
         client = client_of(request)
-        async with queue.reserve_slot(client) as folder:
+        upload_bytes = int(request.headers.get("content-length", 0))
+        async with queue.upload_folder(client, upload_bytes=upload_bytes) as folder:
             await receive_sequence(request, folder, limits, threads)
             async with while_connected(request):
                 status = await queue.accept(folder, query.source, options, client=client)
