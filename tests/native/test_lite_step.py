@@ -37,10 +37,16 @@ FRAMES = 5
 SIZE = (64, 224)  # neither side is a power of two
 
 
-def test_it_gives_the_answers_of_the_exported_graphs(make_step: MakeStep) -> None:
+@pytest.fixture(scope="module")
+def reference() -> OnnxNetwork:
+    return OnnxNetwork(packaged_weights_dir(), "lite")
+
+
+def test_it_gives_the_answers_of_the_exported_graphs(
+    make_step: MakeStep, reference: OnnxNetwork
+) -> None:
     """Each engine goes on from its own state, so differences may add up over the frames."""
     footage = footage_from_source(open_source(ROOM))
-    reference = OnnxNetwork(packaged_weights_dir(), "lite")
     native = {count: make_step(count, threads=2) for count in (1, 4)}
     previous: FootageView | None = None
     for view in footage.views[:FRAMES]:
@@ -64,6 +70,19 @@ def test_it_gives_the_answers_of_the_exported_graphs(make_step: MakeStep) -> Non
         assert (relative <= PARITY_PX).mean() >= WITHIN_PARITY
         theirs, ours = expected.state, (found.next_disparity, found.next_hidden)
         previous = view
+
+
+@pytest.mark.parametrize("iterations", [2, 8])
+def test_many_iterations_give_the_answers_of_the_exported_graphs(
+    make_step: MakeStep, reference: OnnxNetwork, iterations: int
+) -> None:
+    """Each iteration makes a difference ten times as large, so these show the smallest ones."""
+    left, right = random_pair(*SIZE)
+    state = reference.cold_state(*SIZE)
+    expected = reference.run(StepInputs(left[None], right[None], STILL[None], state), iterations)
+    found = make_step(iterations).step(left, right, STILL, *nothing(*SIZE))
+    apart_px = np.abs(found.disparity - expected.disparity_px[0])
+    assert (apart_px <= PARITY_PX).mean() >= WITHIN_PARITY
 
 
 @pytest.mark.parametrize("variant", ["avx2", "avx2_vnni", "avx512_vnni", "neon_dot"])

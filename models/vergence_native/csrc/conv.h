@@ -185,7 +185,7 @@ static inline void sum_row(const Sum *s, const uint8_t *restrict a, const uint8_
                            uint8_t *restrict out) {
     const float ra = s->ra, rb = s->rb, fixed = s->fixed;
     for (int i = 0; i < count; i++) {
-        float v = (float)a[i] * ra + ((float)b[i] * rb + fixed);
+        float v = fmaf((float)a[i], ra, fmaf((float)b[i], rb, fixed));
         out[i] = (uint8_t)(int)rintf(clamped(v, 0.0f, 255.0f));
     }
 }
@@ -197,8 +197,8 @@ static inline void sum_row_doubled(const Sum *s, const uint8_t *restrict a, cons
     for (int x = 0; x < count; x += 2, a += 2 * channels, out += 2 * channels, b += channels)
         for (int c = 0; c < channels; c += LANES)
             for (int i = c; i < c + LANES; i++) {
-                float half = (float)b[i] * rb + fixed;
-                float first = (float)a[i] * ra + half, second = (float)a[i + channels] * ra + half;
+                float half = fmaf((float)b[i], rb, fixed);
+                float first = fmaf((float)a[i], ra, half), second = fmaf((float)a[i + channels], ra, half);
                 out[i] = (uint8_t)(int)rintf(clamped(first, 0.0f, 255.0f));
                 out[i + channels] = (uint8_t)(int)rintf(clamped(second, 0.0f, 255.0f));
             }

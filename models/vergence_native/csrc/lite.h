@@ -54,7 +54,7 @@ typedef struct {
     float scale[MAX_CHANNELS]; /* from sums to bytes of the output */
 } Conv;
 
-/* The sum of two tensors of bytes: c = round(a * ra + (b * rb + fixed)). */
+/* The sum of two tensors of bytes: c = round(a * ra + (b * rb + fixed)), with FMA. */
 typedef struct {
     int is_set;
     float ra, rb, fixed;

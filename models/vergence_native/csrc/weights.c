@@ -253,7 +253,7 @@ VN_EXPORT int vn_model_sum(Model *m, int part, int index, float a_step, int a_ze
         return VN_BAD_WEIGHTS;
     s->ra = ra;
     s->rb = rb;
-    s->fixed = (float)out_zero - (ra * (float)a_zero + rb * (float)b_zero);
+    s->fixed = (float)out_zero - fmaf(ra, (float)a_zero, rb * (float)b_zero);
     s->is_set = 1;
     return VN_OK;
 }
