@@ -1,24 +1,53 @@
-"""A sequence on disk whose truth is known by construction: a textured wall, filmed on the move."""
+"""A textured wall, filmed by a rig that steps aside along it: its truth is known by construction.
+
+The wall is square to the camera, so every pixel has the same disparity.
+"""
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 WIDTH, HEIGHT = 256, 96
 DISPARITY_PX = 6
 FX = 200.0
 BASELINE_M = 0.1
-STEP_PX = 2  # by which the picture shifts from one frame to the next
+
+Texture = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WallFilm:
+    """What the rig sees of ``texture``, uint8 [..., H, W, 3], of which an image shows a part."""
+
+    texture: Texture
+    width: int
+    disparity_px: int
+    step_px: int
+    """By which the image shifts from one frame to the next."""
+
+    def pair(self, frame: int) -> tuple[Texture, Texture]:
+        """The left and the right image, uint8 [..., H, width, 3]."""
+        start = frame * self.step_px
+        left, right = (
+            self.texture[..., at : at + self.width, :] for at in (start, start + self.disparity_px)
+        )
+        return left, right
+
+    def x_m(self, frame: int) -> float:
+        """How far the rig has moved to the right."""
+        return frame * self.step_px * BASELINE_M / self.disparity_px
 
 
 def write_wall(directory: Path, *, frames: int, fps: float = 30.0) -> Path:
-    """Write a ``vergence:`` sequence: the camera moves right along a wall that it faces."""
+    """Write a ``vergence:`` sequence of the wall."""
     directory.mkdir(parents=True)
     noise = np.random.default_rng(7).integers(0, 256, (HEIGHT, 2 * WIDTH, 3), np.uint8)
-    wall = cv2.GaussianBlur(noise, (5, 5), 1.2)
-    metres_per_px = FX * BASELINE_M / DISPARITY_PX / FX
+    wall = np.asarray(cv2.GaussianBlur(noise, (5, 5), 1.2), np.uint8)
+    film = WallFilm(wall, WIDTH, DISPARITY_PX, step_px=2)
     calib = {
         **{"fx": FX, "fy": FX, "cx": (WIDTH - 1) / 2, "cy": (HEIGHT - 1) / 2},
         **{"baseline_m": BASELINE_M, "width": WIDTH, "height": HEIGHT, "fps": fps},
@@ -27,13 +56,12 @@ def write_wall(directory: Path, *, frames: int, fps: float = 30.0) -> Path:
     poses = []
     for index in range(frames):
         stem = f"frame_{index:04d}"
-        start = index * STEP_PX
-        left, right = (wall[:, at : at + WIDTH] for at in (start, start + DISPARITY_PX))
+        left, right = film.pair(index)
         cv2.imwrite(str(directory / f"{stem}_left.png"), left)
         cv2.imwrite(str(directory / f"{stem}_right.png"), right)
         truth = np.full((HEIGHT, WIDTH), 64 * DISPARITY_PX, np.uint16)
         np.savez(directory / f"{stem}_gt.npz", disp=truth)
-        poses.append([1, 0, 0, start * metres_per_px, 0, 1, 0, 0, 0, 0, 1, 0])
+        poses.append([1, 0, 0, film.x_m(index), 0, 1, 0, 0, 0, 0, 1, 0])
     np.savetxt(directory / "poses.txt", poses)
     return directory
 
