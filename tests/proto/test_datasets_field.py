@@ -253,6 +253,25 @@ class TestMiddlebury2006:
         source = open_source(f"middlebury2006:{tmp_path}")
         assert_truth(source, 0, np.full((height, width), 40 / scale, np.float32))
 
+    @pytest.mark.parametrize(
+        ("left", "right", "truth", "scale"),
+        [
+            ("scene1.row3.col3.ppm", "scene1.row3.col4.ppm", "truedisp.row3.col3.pgm", 16),
+            ("im0.pgm", "im1.pgm", "disp0.pgm", 8),
+        ],
+        ids=["tsukuba", "map"],
+    )
+    def test_the_scenes_of_2001_with_other_names(
+        self, left: str, right: str, truth: str, scale: int, tmp_path: Path
+    ) -> None:
+        for seed, name in enumerate((left, right)):
+            image = trees.an_image(seed, 60, 40)
+            trees.write_image(tmp_path / name, image if name.endswith("ppm") else image[..., 0])
+        trees.write_image(tmp_path / truth, np.full((40, 60), 80, np.uint8))
+        assert find_sources(f"middlebury2006:{tmp_path}") == [f"middlebury2006:{tmp_path}"]
+        source = open_source(f"middlebury2006:{tmp_path}")
+        assert_truth(source, 0, np.full((40, 60), 80 / scale, np.float32))
+
     def test_full_size_has_metres(self, tmp_path: Path) -> None:
         folder = field.middlebury2006_scene(tmp_path)
         source = open_source(f"middlebury2006:{folder}?scale=1")

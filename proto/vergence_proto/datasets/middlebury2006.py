@@ -7,6 +7,8 @@
     2003        im2.png im6.png      disp2.png                scale 4 at 450x375, 2 at half size,
                                                               1 at full size
     2001        im2.ppm im6.ppm      disp2.pgm                scale 8
+                (map: im0.pgm im1.pgm disp0.pgm; tsukuba: scene1.row3.col3.ppm, .col4.ppm and
+                truedisp.row3.col3.pgm, scale 16)
 
 Truth is a grey image of 8 bits, disparity times scale, 0 unknown. The scale follows from the
 folder's name or the size of the images; ``?scale=N`` states it. Of 2005 and 2006 the full-size
@@ -24,7 +26,13 @@ from vergence_proto.datasets.packings import nominal_rig, read_scaled, size_of
 from vergence_proto.datasets.source import FrameFiles, StereoSource, Truth, rectified_rig
 from vergence_proto.types import StereoRig
 
-_VIEWS = (("view1", "view5", "disp1"), ("im2", "im6", "disp2"))
+_VIEWS = (
+    ("view1", "view5", "disp1"),
+    ("im2", "im6", "disp2"),
+    ("scene1.row3.col3", "scene1.row3.col4", "truedisp.row3.col3"),
+    ("im0", "im1", "disp0"),
+)
+_VIEW_SCALES = {"scene1.row3.col3": 16.0, "im0": 8.0}
 _FOLDER_SCALES = {"FullSize": 1.0, "HalfSize": 2.0, "ThirdSize": 3.0}
 _FX_FULL = 3740.0
 _BASELINE_M = 0.16
@@ -72,12 +80,16 @@ def _images(path: Path) -> tuple[Path, Path, str] | None:
     for left_name, right_name, truth in _VIEWS:
         left = image_beside(Path("any.png"), path, left_name)
         right = image_beside(left, path, right_name)
+        if left_name == "im0" and left.suffix.lower() != ".pgm":
+            continue  # of another data set
         if left.is_file() and right.is_file():
             return left, right, truth
     return None
 
 
 def _scale(path: Path, left: Path, size: tuple[int, int]) -> float | None:
+    if left.stem in _VIEW_SCALES:
+        return _VIEW_SCALES[left.stem]
     for part in reversed(path.parts):
         if part in _FOLDER_SCALES:
             return _FOLDER_SCALES[part]
