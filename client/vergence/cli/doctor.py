@@ -5,7 +5,7 @@ import platform
 import socket
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from importlib import metadata
 from pathlib import Path
@@ -72,6 +72,12 @@ def examine(text: str, console: Console) -> bool:
     from vergence.source_check import check_source
 
     source = source_at(text).without_truth()
+    missing = source.missing_images
+    if missing:
+        kept = [each for each in source.files if not {each.left, each.right} & {*missing}]
+        source = replace(source, files=kept)
+    for each in (*source.notes, *(f"{path}: not found" for path in missing)):
+        console.print(Text(each), style="yellow", soft_wrap=True)
     has_poses = all(each.world_from_left is not None for each in source.files)
     with console.status(f"matching the images of {source.name}"):
         try:
@@ -82,10 +88,11 @@ def examine(text: str, console: Console) -> bool:
         console.print(Text(f"{advice.mistake}: {advice.sentence}"), style="yellow")
     if not found:
         looked_at = "images, poses and calibration" if has_poses else "images and calibration"
-        console.print(f"{source.name}: nothing wrong; {looked_at} fit each other")
+        wrong = "nothing else wrong" if missing or source.notes else "nothing wrong"
+        console.print(f"{source.name}: {wrong}; {looked_at} fit each other")
     if not has_poses:
         console.print("Not every frame has a pose, so motion was not examined.")
-    return not found
+    return not (found or missing)
 
 
 def _python() -> Finding:

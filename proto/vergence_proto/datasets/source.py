@@ -86,6 +86,12 @@ class StereoSource:
         """True if the ground truth of any frame is there."""
         return any(each.read_truth is not None for each in self.files)
 
+    @property
+    def missing_images(self) -> list[Path]:
+        """The images that are listed and not there, in order."""
+        images = (path for each in self.files for path in (each.left, each.right))
+        return [path for path in images if not path.is_file()]
+
     def without_truth(self) -> "StereoSource":
         """Return the same frames without their ground truth, which takes time to read."""
         return replace(self, files=[replace(each, read_truth=None) for each in self.files])
