@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from vergence_models.captions import captioned
 from vergence_models.config import StepKind
 from vergence_models.data.clips import StereoClips
 from vergence_models.data.pool import ClipPool
@@ -93,10 +94,20 @@ def save_picture(
         estimate, sigma = (t[index].cpu().numpy() for t in (last.disparity, last.sigma))
         top = max(float(truth.max()), 1.0)
         error = np.where(truth > 0, np.abs(estimate - truth), 0)
-        panels = [truth / top, estimate / top, error / 4, sigma / 4]
-        painted = [cv2.applyColorMap(to_bytes(panel), cv2.COLORMAP_TURBO) for panel in panels]
-        rows.append(np.concatenate((image, *painted), axis=1))
+        panels = {
+            "left image": image,
+            f"truth, 0 to {top:.0f} px": painted(truth / top, cv2.COLORMAP_TURBO),
+            "disparity": painted(estimate / top, cv2.COLORMAP_TURBO),
+            "error, 0 to 4 px": painted(error / 4, cv2.COLORMAP_INFERNO),
+            "sigma, 0 to 4 px": painted(sigma / 4, cv2.COLORMAP_INFERNO),
+        }
+        tiles = [captioned(panel, words, width=256) for words, panel in panels.items()]
+        rows.append(np.concatenate(tiles, axis=1))
     cv2.imwrite(str(path), np.concatenate(rows, axis=0))
+
+
+def painted(share: NDArray[np.floating[Any]], colormap: int) -> NDArray[np.uint8]:
+    return np.asarray(cv2.applyColorMap(to_bytes(share), colormap), np.uint8)
 
 
 def to_bytes(share: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:

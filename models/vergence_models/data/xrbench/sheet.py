@@ -9,13 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vergence_models.captions import BACKGROUND, captioned
 from vergence_models.data.xrbench.writer import PASSES
 from vergence_proto.datasets import read_image, read_pfm
 
 Image = NDArray[np.uint8]  # [H, W, 3], RGB
-
-_TILE_WIDTH, _NAME_HEIGHT, _MARGIN = 320, 40, 8
-_BACKGROUND, _INK = (21, 24, 29), (220, 224, 228)
 
 
 def contact_sheet(folder: Path, name: str, frame: int) -> Image:
@@ -43,23 +41,10 @@ def contact_sheet(folder: Path, name: str, frame: int) -> Image:
     tiles["objects and their boxes"] = _objects(
         np.asarray(cv2.imread(str(label), cv2.IMREAD_UNCHANGED)), boxes
     )
-    named = [_named(tile, words) for words, tile in tiles.items()]
+    named = [captioned(tile, words) for words, tile in tiles.items()]
     across = (len(named) + 1) // 2
-    named += [np.full_like(named[0], _BACKGROUND)] * (2 * across - len(named))
+    named += [np.full_like(named[0], BACKGROUND)] * (2 * across - len(named))
     return np.vstack([np.hstack(named[:across]), np.hstack(named[across:])])
-
-
-def _named(tile: Image, words: str) -> Image:
-    """A tile of one width, with a margin and its name below."""
-    height, width = (round(side * _TILE_WIDTH / tile.shape[1]) for side in tile.shape[:2])
-    way = cv2.INTER_NEAREST if width > tile.shape[1] else cv2.INTER_AREA
-    picture = np.full((height + _NAME_HEIGHT, width + 2 * _MARGIN, 3), _BACKGROUND, np.uint8)
-    picture[_MARGIN : _MARGIN + height, _MARGIN : _MARGIN + width] = cv2.resize(
-        tile, (width, height), interpolation=way
-    )
-    place = (_MARGIN, height + _NAME_HEIGHT - 10)
-    cv2.putText(picture, words, place, cv2.FONT_HERSHEY_DUPLEX, 0.45, _INK, 1, cv2.LINE_AA)
-    return picture
 
 
 def _heat(disparity_px: NDArray[np.float32]) -> Image:
