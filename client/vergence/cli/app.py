@@ -98,7 +98,17 @@ def _demo(
     _await(demo(text, frames=frames, out=out, json=json, console=_console()))
 
 
-@app.command("run")
+@app.command(
+    "run",
+    epilog="""
+```
+vergence run recording/                          # a data set in any known layout
+vergence run left.png right.png --fx 640 --baseline 0.12
+vergence run camera:0 --calib rig.json           # both views side by side, until Ctrl-C
+vergence run kitti:DIR/sequences/00 --rate 10    # live at 10 Hz: the newest frame wins
+```
+""",
+)
 def _run(
     source: Annotated[
         list[str],

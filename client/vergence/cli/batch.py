@@ -165,7 +165,9 @@ def _table(outcomes: Sequence[Outcome], seconds: float) -> Table:
     table = Table("sequence", title=title, title_justify="left")
     for name in ("frames", "fps", "EPE px", "D1 %"):
         table.add_column(name, justify="right")
-    table.add_column("")
+    failed = any(each.error for each in outcomes)
+    if failed:
+        table.add_column("error")
     for each in outcomes:
         job = each.job
         accuracy = (job.accuracy if job else None) or {}
@@ -174,6 +176,6 @@ def _table(outcomes: Sequence[Outcome], seconds: float) -> Table:
             each.name,
             str(job.frames) if job else "",
             *(f"{value:.2f}" if value and math.isfinite(value) else "" for value in numbers),
-            each.error or "",
+            *([each.error or ""] if failed else []),
         )
     return table

@@ -1,5 +1,6 @@
 """``vergence doctor``: report what is installed, what is missing, and how to install it."""
 
+import asyncio
 import importlib.util
 import platform
 import socket
@@ -7,6 +8,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import Enum
+from http.client import HTTPConnection, HTTPException
 from importlib import metadata
 from pathlib import Path
 
@@ -54,8 +56,10 @@ class Finding:
 
 async def doctor(server: str, console: Console) -> bool:
     """Print all findings; return False if a requirement of every command is not met."""
-    findings = [_python(), _cpu(), *_packages(), *_ports(), _weights(), _native()]
-    findings.append(await _reachable(server))
+    reached = await _reachable(server)
+    answers = server if reached.verdict is Verdict.GOOD else ""
+    ports = await asyncio.to_thread(lambda: [*_ports(answers)])  # one of them may be asked
+    findings = [_python(), _cpu(), *_packages(), *ports, _weights(), _native(), reached]
     table = Table(show_header=False, box=None)
     for finding in findings:
         # As text: the brackets of an extra are not markup.
@@ -124,17 +128,35 @@ def _packages() -> Iterator[Finding]:
             yield Finding(Verdict.GOOD, package, ", ".join(found))
 
 
-def _ports() -> Iterator[Finding]:
+def _ports(answers: str) -> Iterator[Finding]:
+    """Check the default ports; ``answers`` is the address at which a server was reached."""
     for port, use in _PORTS.items():
+        address = f"127.0.0.1:{port}"
         with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            if sys.platform != "win32":  # there it would allow a port that is taken
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
                 probe.bind(("127.0.0.1", port))
             except OSError as error:
-                taken = f"127.0.0.1:{port} is taken ({error.strerror}): by a running server?"
-                yield Finding(Verdict.NOTE, f"{use} port", taken)
+                if answers.endswith(f":{port}") or _is_alive(port):
+                    yield Finding(Verdict.GOOD, f"{use} port", f"{address}: a Vergence server")
+                else:
+                    taken = f"{address} is taken by another program ({error.strerror})"
+                    yield Finding(Verdict.NOTE, f"{use} port", taken)
             else:
-                yield Finding(Verdict.GOOD, f"{use} port", f"127.0.0.1:{port} is free")
+                yield Finding(Verdict.GOOD, f"{use} port", f"{address} is free")
+
+
+def _is_alive(port: int) -> bool:
+    """Ask for the life sign that a server gives over HTTP."""
+    connection = HTTPConnection("127.0.0.1", port, timeout=1)
+    try:
+        connection.request("GET", "/healthz")
+        return b"alive" in connection.getresponse().read()
+    except (OSError, HTTPException):
+        return False
+    finally:
+        connection.close()
 
 
 def _weights() -> Finding:
