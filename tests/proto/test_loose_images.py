@@ -107,8 +107,33 @@ def test_a_folder_without_images_is_nothing(tmp_path: Path) -> None:
 
 
 def test_sides_of_different_length_are_named(tmp_path: Path) -> None:
-    write(tmp_path / "left" / "0.png")
-    write(tmp_path / "left" / "1.png")
-    write(tmp_path / "right" / "0.png")
+    write(tmp_path / "left" / "first.png")
+    write(tmp_path / "left" / "second.png")
+    write(tmp_path / "right" / "first.png")
     with pytest.raises(DatasetError, match="as many images in left as in right, got 2 and 1"):
         open_image_folder(tmp_path, unknown)
+
+
+@pytest.mark.parametrize(
+    ("lefts", "rights", "pairs"),
+    [
+        ("0 1 2", "0 1 2", "00 11 22"),
+        ("0 1 2 3", "0 1 3", "00 11 22 33"),  # the right image 2 is missing, and named
+        ("1 2 3", "0 1 3", "00 11 22 33"),
+        ("10 20 30", "11 21 31", "10:11 20:21 30:31"),  # numbers of two clocks: in order
+    ],
+    ids=["alike", "one missing", "one missing on each side", "two clocks"],
+)
+def test_images_of_a_folder_belong_together_by_number(
+    lefts: str, rights: str, pairs: str, tmp_path: Path
+) -> None:
+    for side, numbers in (("left", lefts), ("right", rights)):
+        for number in numbers.split():
+            write(tmp_path / side / f"cam_{number}.png", int(number))
+    source = open_image_folder(tmp_path, unknown)
+    assert source is not None
+    found = [(each.left.stem[4:], each.right.stem[4:]) for each in source.files]
+    assert found == [tuple(pair.split(":")) if ":" in pair else (*pair,) for pair in pairs.split()]
+    missing = {path.name for path in source.missing_images}
+    alone = {*lefts.split()} ^ {*rights.split()} if ":" not in pairs else set()
+    assert missing == {f"cam_{number}.png" for number in alone}
