@@ -9,7 +9,7 @@ from typing import Literal
 
 from vergence.dialing import dial, pauses
 from vergence.results import EventKind, SessionEvent
-from vergence.transports.base import Call, ConnectionLost, Transport
+from vergence.transports.base import Call, ClientClosed, ConnectionLost, Transport
 from vergence_proto.errors import (
     DepthError,
     Draining,
@@ -122,6 +122,8 @@ class StreamAttacher:
                 call = call or await self.dial()
                 await self._attach(call)
                 return call
+            except ClientClosed:
+                raise
             except _NO_ROOM as error:
                 refused_s = refused_s or time.monotonic()
                 left_s = refused_s + self._rules.open_timeout_s - time.monotonic()

@@ -2,7 +2,7 @@
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Any, Protocol
 
 from vergence.attaching import RecoveryRules, StreamAttacher
@@ -19,6 +19,9 @@ from vergence_proto.errors import (
 )
 from vergence_proto.v1 import depth_pb2 as pb
 
+Request = bytes | Callable[[], Awaitable[bytes | None]]
+"""A serialized ``pb.StreamDepthRequest``, or a function that makes it when its turn has come."""
+
 RESET = pb.StreamDepthRequest(reset=pb.Reset()).SerializeToString()
 _END = pb.StreamDepthRequest(end=pb.End()).SerializeToString()
 
@@ -34,14 +37,14 @@ _NOTICES = {
 class StreamListener(Protocol):
     """Receives what arrives on a :class:`StreamConnection`; no method may block."""
 
-    def attached(self, opened: pb.StreamOpened) -> list[bytes]:
+    def attached(self, opened: pb.StreamOpened) -> list[Request]:
         """The stream is open, or open again; returns what must be sent again."""
 
     def detached(self, lost: ConnectionLost) -> None:
         """The connection is lost; the stream may be open again later."""
 
-    def answered(self, response: pb.StreamDepthResponse) -> None:
-        """A response about a frame arrived."""
+    async def answered(self, response: pb.StreamDepthResponse) -> None:
+        """A response about a frame arrived; the next one waits for this."""
 
     def ended(self, error: Exception | None) -> None:
         """No response follows; ``error`` is None if the session asked for the end."""
@@ -70,7 +73,7 @@ class StreamConnection:
         self._on_event = on_event
         self._attacher = StreamAttacher(transport, opening, rules, self._report)
         self._name = f"vergence stream {opening.stream_id}"
-        self._outbox: asyncio.Queue[bytes] = asyncio.Queue()
+        self._outbox: asyncio.Queue[Request] = asyncio.Queue()
         self._silence = Silence()
         self._ending = False
         self.state: SessionState = SessionState.RECONNECTING
@@ -101,8 +104,8 @@ class StreamConnection:
             self._runner.cancel()
             await asyncio.gather(self._runner, return_exceptions=True)
 
-    def send(self, request: bytes) -> None:
-        """Queue a ``pb.StreamDepthRequest``, serialized."""
+    def send(self, request: Request) -> None:
+        """Queue a request."""
         self._silence.active()
         self._outbox.put_nowait(request)
 
@@ -151,7 +154,7 @@ class StreamConnection:
         helpers = [asyncio.create_task(self._send_all(call)), asyncio.create_task(self._ping())]
         try:
             while (response := await call.receive()) is not None:
-                self._take(response)
+                await self._take(response)
         except (NotReady, Draining, StreamExpired) as lost:
             if self._attacher.must_raise(lost):
                 raise
@@ -173,8 +176,10 @@ class StreamConnection:
     async def _send_all(self, call: Call) -> None:
         while True:
             request = await self._outbox.get()
-            self._silence.sent(request)
-            await call.send(request)
+            content = request if isinstance(request, bytes) else await request()
+            if content is not None:
+                self._silence.sent(content)
+                await call.send(content)
 
     async def _ping(self) -> None:
         while True:
@@ -259,7 +264,7 @@ class StreamConnection:
         self._silence.begin()
         self.state = SessionState.LIVE
 
-    def _take(self, response: pb.StreamDepthResponse) -> None:
+    async def _take(self, response: pb.StreamDepthResponse) -> None:
         self._silence.heard(response)
         match response.WhichOneof("message"):
             case "pong":
@@ -268,7 +273,7 @@ class StreamConnection:
                 notice = response.notice
                 self._tell(_NOTICES[notice.kind], notice.message, notice.in_s)
             case _:
-                self._listener.answered(response)
+                await self._listener.answered(response)
 
     def _tell(self, kind: EventKind, message: str, in_s: float = 0.0) -> None:
         self._report(SessionEvent(kind, message, in_s))

@@ -4,7 +4,7 @@ import asyncio
 import random
 from collections.abc import Callable, Iterator
 
-from vergence.transports.base import Call, ConnectionLost, Transport
+from vergence.transports.base import Call, ClientClosed, ConnectionLost, Transport
 
 # Three round trips at most: TCP, then TLS or HTTP/2, then the call.
 _ATTEMPT_S = 5.0
@@ -45,6 +45,8 @@ async def dial(
                 attempts.discard(attempt)
                 try:
                     return attempt.result()
+                except ClientClosed:
+                    raise
                 except ConnectionLost as lost:
                     failed(lost)
     finally:

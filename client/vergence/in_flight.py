@@ -1,7 +1,7 @@
 """The frames of a session that were sent and not answered, and the count of those dropped."""
 
 import asyncio
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 from vergence.results import DepthResult, Drops
@@ -12,8 +12,11 @@ class FrameInFlight:
     """A frame that was sent and not answered yet."""
 
     frame_id: int
-    request: bytes
-    """The serialized request, kept to send it again after a reconnection."""
+    request: bytes | Callable[[], bytes]
+    """The serialized request, or the function that makes it, which works on whole images.
+
+    It is used again after a reconnection.
+    """
     answer: asyncio.Future[DepthResult] | None
     """The result that ``step`` waits for; None for a live frame, whose result is iterated."""
 
@@ -60,6 +63,10 @@ class FramesInFlight:
             if frame.answer is None:
                 self.count(lost=1)
             frame.fail(error)
+
+    def __contains__(self, frame_id: int) -> bool:
+        """Return True if the frame has no answer yet."""
+        return frame_id in self._by_id
 
     def in_order(self) -> list[FrameInFlight]:
         """Return all frames without an answer, in the order they were sent."""

@@ -58,6 +58,7 @@ from vergence_proto.types import (
     OutputFormat,
     PlaneEncoding,
     PoseSample,
+    ReceivedPlanes,
     StereoRig,
     Timings,
 )
@@ -106,6 +107,7 @@ __all__ = [
     "PoseSample",
     "QueueFull",
     "Quota",
+    "ReceivedPlanes",
     "RectifiedRig",
     "SequenceNotDone",
     "ServerInfo",

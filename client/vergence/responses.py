@@ -2,18 +2,20 @@
 
 import asyncio
 from collections import deque
+from concurrent.futures import Executor
 from dataclasses import fields
+from functools import partial
 
 from vergence.capture_clock import age_of
-from vergence.connection import RESET
-from vergence.in_flight import FramesInFlight
+from vergence.connection import RESET, Request
+from vergence.in_flight import FrameInFlight, FramesInFlight
 from vergence.recent import RecentResults
 from vergence.results import DepthResult, Drops
 from vergence.transports.base import ConnectionLost
 from vergence_proto import codec
 from vergence_proto.errors import DepthError, FrameStale
 from vergence_proto.geometry import Axes, RectifiedRig
-from vergence_proto.types import DisparityMap
+from vergence_proto.types import DisparityMap, ReceivedPlanes
 from vergence_proto.v1 import depth_pb2 as pb
 
 
@@ -25,13 +27,14 @@ class ResponseRouter:
 
     rig: RectifiedRig
 
-    def __init__(self, in_flight: FramesInFlight, axes: Axes) -> None:
+    def __init__(self, in_flight: FramesInFlight, axes: Axes, threads: Executor) -> None:
         self.recent: RecentResults = RecentResults()
         self.opened: pb.StreamOpened | None = None  # None: the stream was never open
         self.error: Exception | None = None  # the error that ended the stream
         self.reset_after: int | None = None  # the last frame before a reset not yet confirmed
         self._in_flight = in_flight
         self._axes = axes
+        self._threads = threads
         self._ended = False
         self._unread: deque[DepthResult | DepthError] = deque()
         self._arrived = asyncio.Event()
@@ -53,7 +56,25 @@ class ResponseRouter:
             raise item
         return item
 
-    def attached(self, opened: pb.StreamOpened) -> list[bytes]:
+    def request_of(self, frame: FrameInFlight) -> Request:
+        """Return the frame's request; if its images must be encoded, a thread does it later."""
+        if isinstance(frame.request, bytes):
+            return frame.request
+        encode = frame.request
+
+        async def encoded() -> bytes | None:
+            if frame.frame_id not in self._in_flight:  # it was given up meanwhile
+                return None
+            loop = asyncio.get_running_loop()
+            try:
+                return await loop.run_in_executor(self._threads, encode)
+            except DepthError as error:
+                self._failed(frame.frame_id, error)
+                return None
+
+        return encoded
+
+    def attached(self, opened: pb.StreamOpened) -> list[Request]:
         """Record the open stream; return the requests that must be sent again."""
         self.opened = opened
         self.rig = codec.rectified_rig_from_proto(opened.rig)
@@ -62,7 +83,7 @@ class ResponseRouter:
         frames = self._in_flight.in_order()
         self._in_flight.fail((f for f in frames if f.frame_id <= opened.last_frame_id), taken)
         frames = self._in_flight.in_order()
-        requests = [frame.request for frame in frames]
+        requests = [self.request_of(frame) for frame in frames]
         if self.reset_after is not None:
             before = sum(frame.frame_id <= self.reset_after for frame in frames)
             requests.insert(before, RESET)
@@ -80,11 +101,11 @@ class ResponseRouter:
         self._in_flight.fail(self._in_flight.in_order(), unanswered)
         self._arrived.set()
 
-    def answered(self, response: pb.StreamDepthResponse) -> None:
-        """Route one response to its frame."""
+    async def answered(self, response: pb.StreamDepthResponse) -> None:
+        """Route one response to its frame; a thread decodes the maps."""
         match response.WhichOneof("message"):
             case "disparity":
-                self._map(response.disparity)
+                await self._map(response.disparity)
             case "frame_error":
                 message = response.frame_error
                 self._failed(message.frame_id, codec.error_from_frame_error(message))
@@ -92,18 +113,24 @@ class ResponseRouter:
                 for frame_id in response.frames_dropped.frame_ids:
                     self._dropped(frame_id)
 
-    def _map(self, message: pb.DisparityMap) -> None:
+    async def _map(self, message: pb.DisparityMap) -> None:
         age_s = age_of(message.capture_ns)
         if self.reset_after is not None and message.frame_id > self.reset_after:
             self.reset_after = None
+        work = partial(_decoded, message, self.rig)
+        plain = message.disparity.compression == pb.COMPRESSION_NONE and message.map_step <= 1
         try:
-            disparity_map = codec.disparity_from_proto(message, self.rig)
+            if plain:
+                disparity_map, raw = work()
+            else:
+                loop = asyncio.get_running_loop()
+                disparity_map, raw = await loop.run_in_executor(self._threads, work)
         except DepthError as error:  # a damaged answer fails its own frame only
             self._failed(message.frame_id, error)
             return
         frame = self._in_flight.pop(message.frame_id)
         result = _depth_result(
-            disparity_map, age_s=age_s, drops=self._in_flight.drops, axes=self._axes
+            disparity_map, raw, age_s=age_s, drops=self._in_flight.drops, axes=self._axes
         )
         if frame is None:
             return
@@ -142,8 +169,13 @@ class ResponseRouter:
         self._arrived.set()
 
 
+def _decoded(message: pb.DisparityMap, rig: RectifiedRig) -> tuple[DisparityMap, ReceivedPlanes]:
+    received = codec.received_planes_from_proto(message, rig)
+    return codec.disparity_from_proto(message, rig, received), received
+
+
 def _depth_result(
-    disparity_map: DisparityMap, *, age_s: float, drops: Drops, axes: Axes
+    disparity_map: DisparityMap, raw: ReceivedPlanes, *, age_s: float, drops: Drops, axes: Axes
 ) -> DepthResult:
     values = {each.name: getattr(disparity_map, each.name) for each in fields(DisparityMap)}
-    return DepthResult(**values, age_s=age_s, drops=drops, axes=axes)
+    return DepthResult(**values, raw=raw, age_s=age_s, drops=drops, axes=axes)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from vergence_proto.errors import BadPose
 from vergence_proto.geometry import Axes
-from vergence_proto.types import DisparityMap
+from vergence_proto.types import DisparityMap, ReceivedPlanes
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +54,8 @@ class DepthResult(DisparityMap):
     """The drops of the session until this result."""
     axes: Axes = Axes.OPENCV
     """The axes of ``world_from_left``: those of the session."""
+    raw: ReceivedPlanes | None = None
+    """The map as it was received: fewer pixels, if the output's ``map_step`` is above 1."""
 
     def points_m(self, *, world: bool = False) -> NDArray[np.float32]:
         """Return the pixels as points in metres, in the axes of the session.

@@ -2,7 +2,7 @@
 
 import asyncio
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Self
 
 import numpy as np
@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from vergence.capture_clock import CaptureClock
 from vergence.connection import RESET
 from vergence.errors import NotOpen, WrongDelivery
+from vergence.image_format import frame_request
 from vergence.in_flight import FrameInFlight
 from vergence.results import DepthResult, NotSent, SessionState
 from vergence.session_facts import SessionFacts, SessionParts, SessionSetup
-from vergence_proto import codec
 from vergence_proto.geometry import Matrix, Pose
 from vergence_proto.types import Delivery, PoseSample, StereoFrame
 
@@ -276,22 +276,26 @@ class DepthSession(SessionFacts):
         world_from_left: WorldFromLeft,
         capture_ns: int | None,
         max_age_s: float | None,
-    ) -> bytes:
+    ) -> bytes | Callable[[], bytes]:
         if world_from_left is not None and not isinstance(world_from_left, (Pose, PoseSample)):
             world_from_left = Pose.from_matrix(world_from_left)
         if isinstance(world_from_left, Pose):
             world_from_left = PoseSample(world_from_left)
         capture_ns = self._clock.checked_ns(capture_ns)
         frame = StereoFrame(self._next_id, capture_ns, left, right, world_from_left)
-        return codec.frame_to_request(
-            frame,
-            encoding=self._parts.setup.encoding,
-            jpeg_quality=self._parts.setup.jpeg_quality,
-            max_age_s=max_age_s,
+        setup = self._parts.setup
+        camera = setup.opening.rig.left
+        return frame_request(
+            frame, setup.images, size=(camera.width, camera.height), max_age_s=max_age_s
         )
 
-    def _send(self, request: bytes, answer: asyncio.Future[DepthResult] | None) -> int:
+    def _send(
+        self,
+        request: bytes | Callable[[], bytes],
+        answer: asyncio.Future[DepthResult] | None,
+    ) -> int:
         frame_id, self._next_id = self._next_id, self._next_id + 1
-        self._parts.in_flight.add(FrameInFlight(frame_id, request, answer))
-        self._parts.connection.send(request)
+        frame = FrameInFlight(frame_id, request, answer)
+        self._parts.in_flight.add(frame)
+        self._parts.connection.send(self._parts.responses.request_of(frame))
         return frame_id

@@ -1,6 +1,7 @@
 """What a session knows of its stream, the same for asynchronous and blocking callers."""
 
 from collections.abc import Callable
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Self
 
@@ -9,6 +10,7 @@ import numpy as np
 from vergence.attaching import RecoveryRules
 from vergence.connection import StreamConnection
 from vergence.errors import NotOpen
+from vergence.image_format import ImageFormat
 from vergence.in_flight import FramesInFlight
 from vergence.info import ModelInfo
 from vergence.info_codec import model_info_from_proto
@@ -18,7 +20,7 @@ from vergence.results import DepthResult, Drops, SessionEvent, SessionState
 from vergence.transports.base import Transport
 from vergence_proto import codec
 from vergence_proto.geometry import Matrix, Pose, RectifiedRig
-from vergence_proto.types import Delivery, ImageEncoding, PoseSample
+from vergence_proto.types import Delivery, PoseSample
 from vergence_proto.v1 import depth_pb2 as pb
 
 
@@ -29,8 +31,8 @@ class SessionSetup:
     transport: Transport
     opening: pb.OpenStream
     delivery: Delivery
-    encoding: ImageEncoding
-    jpeg_quality: int
+    images: ImageFormat
+    threads: Executor  # for work on whole images
     on_event: Callable[[SessionEvent], None] | None
     rules: RecoveryRules
 
@@ -47,7 +49,8 @@ class SessionParts:
     @classmethod
     def of(cls, setup: SessionSetup) -> Self:
         in_flight = FramesInFlight()
-        responses = ResponseRouter(in_flight, codec.axes_from_proto(setup.opening.axes))
+        axes = codec.axes_from_proto(setup.opening.axes)
+        responses = ResponseRouter(in_flight, axes, setup.threads)
         connection = StreamConnection(
             setup.transport, setup.opening, responses, setup.on_event, setup.rules
         )

@@ -5,7 +5,7 @@ The codec and the data set readers make them and check them. Code below those do
 
 import math
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
 
@@ -260,18 +260,35 @@ class Delivery(Enum):
 
 @dataclass(frozen=True, slots=True)
 class OutputFormat:
-    """The content and precision of results. The default is the smallest, exact to 1/64 px."""
+    """The content and precision of results.
+
+    A value of 0 is chosen by the session: the smallest maps for live sessions off this machine, and
+    maps exact to 1/64 px otherwise.
+    """
 
     encoding: PlaneEncoding = PlaneEncoding.UINT16
     """The number format of the disparity map."""
-    denominator: int = 64
-    """UINT16 only, 16 to 64: the stored number is ``round(disparity_px * denominator)``."""
+    denominator: int = 0
+    """UINT16 only, 4 to 64: the stored number is ``round(disparity_px * denominator)``. 0: 16 for
+    live sessions off this machine, else 64."""
     compressed: bool = True
     """UINT16 only: compress the map without loss."""
     confidence: bool = False
     """Request :attr:`DisparityMap.confidence`."""
     sigma: bool = False
     """Request :attr:`DisparityMap.sigma_px`."""
+    map_step: int = 0
+    """Send every first, second or fourth row and column: 1, 2 or 4. The client interpolates the
+    others. 0: 2 for UINT16 and live sessions off this machine, else 1."""
+
+    def resolved(self, *, small: bool = False) -> "OutputFormat":
+        """Return the format with values for zeros: for small messages, or exact ones."""
+        small = small and self.encoding is PlaneEncoding.UINT16
+        return replace(
+            self,
+            denominator=self.denominator or (16 if small else 64),
+            map_step=self.map_step or (2 if small else 1),
+        )
 
 
 class Origin(Enum):
@@ -311,6 +328,24 @@ class Timings:
     """Time to encode the result."""
     total_s: float = 0.0
     """Time from the frame's arrival to the hand-over of its result to the transport."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReceivedPlanes:
+    """The planes of a result as they were received: every step-th row and column, from the first.
+
+    The pixel (i, j) is the pixel (step * i, step * j) of the result. Values are in pixels of the
+    whole image.
+    """
+
+    step: int
+    """The distance between two of these pixels in the result: 1, 2 or 4."""
+    disparity_px: Plane
+    """Float32 [ceil(H / step), ceil(W / step)], pixels; NaN: no value."""
+    sigma_px: Plane | None = None
+    """Float32, of the same shape; None if not requested."""
+    confidence: NDArray[np.uint8] | None = None
+    """Uint8, of the same shape; None if not requested."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

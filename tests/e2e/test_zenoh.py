@@ -18,6 +18,7 @@ from vergence import (
     DepthResult,
     DepthSession,
     FrameTooLarge,
+    ImageEncoding,
     OutputFormat,
     PlaneEncoding,
     StreamExists,
@@ -45,7 +46,9 @@ async def test_a_sequence_is_answered_alike_over_grpc_and_zenoh(delivery: Delive
     async def walk(address: str) -> list[DepthResult]:
         async with (
             DepthClient(address) as client,
-            client.open_session(RIG, delivery=delivery, output=EXACT) as session,
+            client.open_session(
+                RIG, delivery=delivery, output=EXACT, encoding=ImageEncoding.RAW
+            ) as session,
         ):
             return [await step(session, frame_id) for frame_id in range(1, 11)]
 
@@ -167,7 +170,7 @@ async def test_a_frame_over_the_limit_is_refused_and_the_stream_lives_on() -> No
     async with (
         lone_server(limits__max_frame_mib=1) as (_, address),
         DepthClient(address) as client,
-        client.open_session(RIG) as session,
+        client.open_session(RIG, encoding=ImageEncoding.RAW) as session,
     ):
         with pytest.raises(FrameTooLarge, match="1048576"):
             await session.step(big, big)

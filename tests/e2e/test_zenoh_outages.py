@@ -12,6 +12,7 @@ import pytest
 from tests.support.frames import RIG
 from tests.support.models import RecallModel
 from tests.support.polling import eventually
+from tests.support.session_frames import EXACT
 from tests.support.zenoh_net import router
 from tests.support.zenoh_sessions import LOSSLESS, attached, lone_server, server_on, step, submit
 from vergence import (
@@ -19,6 +20,7 @@ from vergence import (
     DepthClient,
     Draining,
     EventKind,
+    ImageEncoding,
     NotSent,
     Origin,
     SessionEvent,
@@ -90,7 +92,7 @@ async def test_what_the_network_loses_is_found_out_and_gives_its_credit_back(way
         lossy as between,
         server_on(between.endpoint) as server,
         DepthClient(between.address) as client,
-        client.open_session(RIG) as session,
+        client.open_session(RIG, encoding=ImageEncoding.RAW, output=EXACT) as session,
     ):
         stream = server.engine.streams.get(session.stream_id)
         for frame_id in range(1, 1 + session.credit):

@@ -1,5 +1,7 @@
 """A stream's settings travel whole, and errors keep their class."""
 
+from types import ModuleType
+
 import pytest
 from google.rpc import error_details_pb2
 from hypothesis import given
@@ -16,10 +18,11 @@ from vergence_proto.v1 import depth_pb2 as pb
 class TestSettings:
     @given(
         st.sampled_from(PlaneEncoding),
-        st.integers(16, 64),
+        st.integers(4, 64),
         st.booleans(),
         st.booleans(),
         st.booleans(),
+        st.sampled_from([1, 2, 4]),
     )
     def test_output_round_trip(
         self,
@@ -28,18 +31,28 @@ class TestSettings:
         compressed: bool,
         confidence: bool,
         sigma: bool,
+        map_step: int,
     ) -> None:
-        output = OutputFormat(encoding, denominator, compressed, confidence, sigma)
+        output = OutputFormat(encoding, denominator, compressed, confidence, sigma, map_step)
         assert codec.output_format_from_proto(codec.output_format_to_proto(output)) == output
 
     def test_an_empty_format_is_the_default(self) -> None:
-        assert codec.output_format_from_proto(pb.OutputFormat()) == OutputFormat()
+        exact = codec.output_format_from_proto(pb.OutputFormat())
+        assert exact == OutputFormat().resolved()
+        assert (exact.denominator, exact.map_step) == (64, 1)
 
-    @pytest.mark.parametrize("denominator", [1, 15, 65, 1000])
+    @pytest.mark.parametrize("map_step", [3, 8])
+    def test_a_map_step_out_of_range_is_refused_on_both_sides(self, map_step: int) -> None:
+        with pytest.raises(BadShape, match="1, 2 or 4"):
+            codec.output_format_from_proto(pb.OutputFormat(map_step=map_step))
+        with pytest.raises(BadShape, match="1, 2 or 4"):
+            codec.output_format_to_proto(OutputFormat(map_step=map_step))
+
+    @pytest.mark.parametrize("denominator", [1, 3, 65, 1000])
     def test_a_denominator_out_of_range_is_refused_on_both_sides(self, denominator: int) -> None:
-        with pytest.raises(BadShape, match="16 to 64"):
+        with pytest.raises(BadShape, match="4 to 64"):
             codec.output_format_from_proto(pb.OutputFormat(denominator=denominator))
-        with pytest.raises(BadShape, match="16 to 64"):
+        with pytest.raises(BadShape, match="4 to 64"):
             codec.output_format_to_proto(OutputFormat(denominator=denominator))
 
     @pytest.mark.parametrize("encoding", [pb.PLANE_ENCODING_UINT8, 99])
@@ -118,5 +131,9 @@ def test_a_status_of_another_program_is_not_ours() -> None:
 
 
 def test_the_list_of_public_names_is_sorted_and_complete() -> None:
-    public = {name for name in vars(codec) if "_to_" in name or "_from_" in name}
+    public = {
+        name
+        for name, value in vars(codec).items()
+        if not name.startswith("_") and not isinstance(value, ModuleType)
+    }
     assert codec.__all__ == sorted(public)

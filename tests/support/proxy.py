@@ -20,6 +20,7 @@ class Proxy:
         self._whole = True
         self._upward = _open_gate()
         self._wire = _open_gate()
+        self._dead: set[asyncio.Event] = set()  # the gates of forgotten connections
         self.address = ""
         self.accepted = 0
 
@@ -55,6 +56,7 @@ class Proxy:
         So it is when the client's address has changed.
         """
         self._wire.clear()
+        self._dead.add(self._wire)
         self._wire = _open_gate()
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -106,7 +108,8 @@ class Proxy:
                 while data := await reader.read(1 << 16):
                     travelling.put_nowait((loop.time() + self._delay_s, data))
                 travelling.put_nowait((loop.time() + self._delay_s, b""))
-                await arriving
+                if not self._dead.intersection(gates):
+                    await arriving
         finally:
             arriving.cancel()
             writer.transport.abort()

@@ -28,7 +28,7 @@ from vergence_proto.accuracy import Accuracy
 from vergence_proto.datasets import SourceFrame
 from vergence_proto.jobs import Output
 from vergence_proto.ordered import in_order
-from vergence_proto.types import Delivery, OutputFormat
+from vergence_proto.types import Delivery, ImageEncoding, OutputFormat
 
 # So many files may be in writing while the next frames are stepped.
 _WRITES_AT_ONCE = 4
@@ -161,7 +161,8 @@ async def _session(
     async with client.open_session(
         footage.rig,
         delivery=pace.delivery,
-        output=output,
+        output=output.resolved(),  # every pixel, whatever the link
+        encoding=ImageEncoding.RAW,
         iterations=iterations,
         cold_iterations=iterations if footage.alone else 0,
         # Without a frame left out, a cold start would change what is written.

@@ -18,6 +18,13 @@ class ConnectionLost(NotReady):
     """
 
 
+class ClientClosed(ConnectionLost):
+    """The client was closed: no attempt will succeed."""
+
+    def __init__(self) -> None:
+        super().__init__("the client was closed")
+
+
 class Call(Protocol):
     """One attachment to a stream: requests go up, responses come down, each in order."""
 
@@ -43,8 +50,8 @@ class Transport(Protocol):
     async def open_call(self, stream_id: str) -> Call:
         """Connect, and start a StreamDepth call on a connection of its own.
 
-        Every frame of ``stream_id`` must reach the same server. Raises ConnectionLost; may wait for
-        as long as the network is silent.
+        Every frame of ``stream_id`` must reach the same server. It may wait for as long as the
+        network is silent. Raises ConnectionLost, and ClientClosed after :meth:`close`.
         """
 
     async def ask(self, method: str, request: Message, answer: type[Answer]) -> Answer:

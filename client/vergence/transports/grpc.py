@@ -9,7 +9,7 @@ import grpc
 from google.protobuf.message import Message
 from grpc_status import rpc_status
 
-from vergence.transports.base import Answer, Call, ConnectionLost
+from vergence.transports.base import Answer, Call, ClientClosed, ConnectionLost
 from vergence.transports.forks import use_grpc
 from vergence.transports.proxies import through_proxy
 from vergence_proto import codec
@@ -54,10 +54,13 @@ class GrpcTransport:
         self._options = (*_CHANNEL_OPTIONS, ("grpc.enable_http_proxy", int(not direct)))
         self._through = "" if direct else through_proxy(f"grpc://{address}")
         self._channel = self._connection()
+        self._closed = False
         self._calls: set[_GrpcCall] = set()
 
     async def open_call(self, stream_id: str) -> Call:
         # A channel of its own, because a new one can connect while TCP still waits for the old.
+        if self._closed:
+            raise ClientClosed
         channel = self._connection()
         start = channel.stream_stream(
             f"{_SERVICE}StreamDepth",
@@ -91,6 +94,7 @@ class GrpcTransport:
         return response
 
     async def close(self) -> None:
+        self._closed = True
         await self._channel.close(grace=None)
         for call in list(self._calls):
             await call.close()

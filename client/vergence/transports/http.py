@@ -8,7 +8,7 @@ import httpx
 from google.protobuf.message import Message
 
 from vergence.transports.addresses import on_this_machine
-from vergence.transports.base import Answer, Call, ConnectionLost
+from vergence.transports.base import Answer, Call, ClientClosed, ConnectionLost
 from vergence.transports.proxies import through_proxy
 from vergence_proto import codec
 from vergence_proto.errors import DepthError, NotReady, error_from_wire
@@ -82,7 +82,7 @@ class HttpTransport:
 
     def _check_open(self) -> None:
         if self._http.is_closed:
-            raise ConnectionLost(f"the connection to {self._http.base_url} was closed")
+            raise ClientClosed
 
 
 class _HttpCall:

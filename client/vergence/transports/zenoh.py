@@ -9,7 +9,7 @@ from pathlib import Path
 import zenoh
 from google.protobuf.message import Message
 
-from vergence.transports.base import Answer, Call, ConnectionLost
+from vergence.transports.base import Answer, Call, ClientClosed, ConnectionLost
 from vergence.transports.zenoh_call import ServerInfos, ZenohCall
 from vergence_proto.errors import DepthError, StreamExpired, UnknownStream
 from vergence_proto.v1 import depth_pb2 as pb
@@ -52,7 +52,7 @@ class ZenohTransport:
         call = ZenohCall(peer, self._namespace, stream_id, find, before)
         if self._closed:
             await call.close()
-            raise ConnectionLost(f"the connection to {self._endpoint} was closed")
+            raise ClientClosed
         self._calls[stream_id] = call
         return call
 
@@ -74,7 +74,7 @@ class ZenohTransport:
 
     async def _opened(self) -> ZenohSession:
         if self._closed:
-            raise ConnectionLost(f"the connection to {self._endpoint} was closed")
+            raise ClientClosed
         config = make_config(
             self._config,
             max_message_bytes=_MAX_MESSAGE_BYTES,

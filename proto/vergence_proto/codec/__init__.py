@@ -20,10 +20,11 @@ from vergence_proto.codec.frames import (
     origin_to_proto,
     output_format_from_proto,
     output_format_to_proto,
+    received_planes_from_proto,
     timings_from_proto,
     timings_to_proto,
 )
-from vergence_proto.codec.images import image_from_proto, image_to_wire
+from vergence_proto.codec.images import check_image, image_from_proto, image_to_wire
 from vergence_proto.codec.planes import plane_from_proto, plane_to_proto
 from vergence_proto.codec.requests import (
     ReceivedFrame,
@@ -45,13 +46,16 @@ from vergence_proto.codec.rigs import (
     rig_to_proto,
 )
 from vergence_proto.codec.status import error_from_status, error_to_status
+from vergence_proto.codec.steps import MAX_FRAME_SCALE, reduced
 
 __all__ = [
+    "MAX_FRAME_SCALE",
     "ReceivedFrame",
     "Request",
     "axes_from_proto",
     "axes_to_proto",
     "check_frame",
+    "check_image",
     "decode_frame",
     "delivery_from_proto",
     "delivery_to_proto",
@@ -78,8 +82,10 @@ __all__ = [
     "read_frame",
     "read_request",
     "read_small",
+    "received_planes_from_proto",
     "rectified_rig_from_proto",
     "rectified_rig_to_proto",
+    "reduced",
     "rig_from_proto",
     "rig_to_proto",
     "timings_from_proto",

@@ -2,6 +2,8 @@
 
 import math
 
+import numpy as np
+
 from vergence_proto.codec.enums import (
     COMPRESSED,
     DELIVERY,
@@ -10,7 +12,7 @@ from vergence_proto.codec.enums import (
     number_of,
     value_of,
 )
-from vergence_proto.codec.images import image_from_proto, image_to_wire
+from vergence_proto.codec.images import check_image, image_from_proto, image_to_wire
 from vergence_proto.codec.planes import (
     bytes_plane_from_proto,
     bytes_plane_to_proto,
@@ -25,6 +27,15 @@ from vergence_proto.codec.rigs import (
     pose_sample_to_proto,
     pose_to_proto,
 )
+from vergence_proto.codec.steps import (
+    FRAME_SCALES,
+    check_map_step,
+    enlarge_image,
+    reduce_image,
+    reduced,
+    widen_bytes,
+    widen_plane,
+)
 from vergence_proto.codec.wire import Piece, delimited
 from vergence_proto.errors import BadImage, BadShape, DepthError, FrameTooLarge, error_from_wire
 from vergence_proto.geometry import RectifiedRig
@@ -35,6 +46,7 @@ from vergence_proto.types import (
     ImageEncoding,
     Origin,
     OutputFormat,
+    ReceivedPlanes,
     StereoFrame,
     Timings,
 )
@@ -52,15 +64,20 @@ def frame_to_request(
     *,
     encoding: ImageEncoding,
     jpeg_quality: int = 90,
+    scale: int = 1,
     max_age_s: float | None = None,
 ) -> bytes:
     """Encode a pair as the bytes of a ``pb.StreamDepthRequest``; images are copied only once.
+
+    With ``scale`` 2 the images are sent at half size.
 
     Raises BadImage: an image is not uint8 [H, W, 3] or [H, W], is empty, or does not fit its
     encoding.
     Raises BadPose: the pose is not finite, or its matrix is no rotation.
     """
     message = pb.Frame(frame_id=frame.frame_id, capture_ns=frame.capture_ns, max_age_s=max_age_s)
+    if scale != 1:
+        message.scale = scale
     if frame.pose is not None:
         message.pose.CopyFrom(pose_sample_to_proto(frame.pose))
     pieces: list[Piece] = [message.SerializeToString()]
@@ -68,7 +85,8 @@ def frame_to_request(
         (frame.left, pb.Frame.LEFT_FIELD_NUMBER),
         (frame.right, pb.Frame.RIGHT_FIELD_NUMBER),
     ):
-        pieces += delimited(number, *image_to_wire(image, encoding, jpeg_quality=jpeg_quality))
+        sent = image if scale == 1 else reduce_image(check_image(image), scale)
+        pieces += delimited(number, *image_to_wire(sent, encoding, jpeg_quality=jpeg_quality))
     return b"".join(delimited(pb.StreamDepthRequest.FRAME_FIELD_NUMBER, *pieces))
 
 
@@ -78,7 +96,7 @@ def frame_from_proto(
     """Check and decode a frame, as :func:`check_frame` and :func:`decode_frame` do."""
     received = ReceivedFrame.of(message)
     check_frame(received, size=size, max_bytes=max_bytes)
-    return decode_frame(received)
+    return decode_frame(received, size=size)
 
 
 def check_frame(
@@ -86,12 +104,12 @@ def check_frame(
 ) -> None:
     """Check a frame without decoding it.
 
-    ``size`` is the required (width, height) of both images, ``max_bytes`` the limit on the bytes of
+    ``size`` is the (width, height) of the stream's images, ``max_bytes`` the limit on the bytes of
     both together.
 
     Raises FrameTooLarge: the images have more than ``max_bytes``, or far more than their pixels.
-    Raises BadShape: the frame id is 0, the sizes differ from ``size`` or from each other, or the
-    maximum age is negative or not finite.
+    Raises BadShape: the frame id is 0, the sizes differ from ``size``, reduced by the scale, or
+    from each other, the scale is not 1 or 2, or the maximum age is negative or not finite.
     """
     message = received.fields
     if message.frame_id == 0:
@@ -104,9 +122,13 @@ def check_frame(
             f"both images must have one size, got left {left.width}x{left.height} "
             f"and right {right.width}x{right.height}"
         )
-    if size is not None and (left.width, left.height) != size:
+    scale = message.scale or 1
+    if scale not in FRAME_SCALES:
+        raise BadShape(f"expected a scale of 1 or 2, got {scale}")
+    if size is not None and (left.width, left.height) != (sent := reduced(size, scale)):
+        reduction = "" if scale == 1 else f" at scale {scale}"
         raise BadShape(
-            f"expected images of {size[0]}x{size[1]}, as the stream was opened with, "
+            f"expected images of {sent[0]}x{sent[1]}, as the stream was opened with{reduction}, "
             f"got {left.width}x{left.height}"
         )
     left_bytes, right_bytes = len(received.left.data), len(received.right.data)
@@ -123,18 +145,23 @@ def check_frame(
         )
 
 
-def decode_frame(received: ReceivedFrame) -> StereoFrame:
+def decode_frame(received: ReceivedFrame, *, size: tuple[int, int] | None = None) -> StereoFrame:
     """Decode both images and the pose of a frame that :func:`check_frame` accepts.
+
+    Images that were sent smaller are enlarged to ``size``, if it is given.
 
     Raises BadImage: an image is not whole, or not of the stated encoding and size.
     Raises BadPose: a valid part of the pose is not finite, or its quaternion is not of unit length.
     """
     message = received.fields
+    left, right = _side(received.left, "left"), _side(received.right, "right")
+    if size is not None and message.scale > 1:
+        left, right = enlarge_image(left, size), enlarge_image(right, size)
     return StereoFrame(
         frame_id=message.frame_id,
         capture_ns=message.capture_ns,
-        left=_side(received.left, "left"),
-        right=_side(received.right, "right"),
+        left=left,
+        right=right,
         pose=pose_sample_from_proto(message.pose) if message.HasField("pose") else None,
     )
 
@@ -149,7 +176,10 @@ def disparity_to_proto(
     """
     message = pb.DisparityMap() if into is None else into
     message.frame_id, message.capture_ns = disparity.frame_id, disparity.capture_ns
-    plane_to_proto(disparity.disparity_px, output, into=message.disparity)
+    step = output.resolved().map_step
+    if step != 1:
+        message.map_step = step
+    plane_to_proto(disparity.disparity_px[::step, ::step], output, into=message.disparity)
     message.origin = origin_to_proto(disparity.origin)
     message.step_count, message.iterations = disparity.step_count, disparity.iterations
     message.frames_skipped = disparity.frames_skipped
@@ -158,39 +188,67 @@ def disparity_to_proto(
         message.max_disparity_px = disparity.max_disparity_px
     if output.confidence and disparity.confidence is not None:
         bytes_plane_to_proto(
-            disparity.confidence, compressed=output.compressed, into=message.confidence
+            np.ascontiguousarray(disparity.confidence[::step, ::step]),
+            compressed=output.compressed,
+            into=message.confidence,
         )
     if output.sigma and disparity.sigma_px is not None:
-        plane_to_proto(disparity.sigma_px, output, into=message.sigma)
+        plane_to_proto(disparity.sigma_px[::step, ::step], output, into=message.sigma)
     if disparity.world_from_left is not None:
         message.world_from_left.CopyFrom(pose_to_proto(disparity.world_from_left))
     return message
 
 
-def disparity_from_proto(message: pb.DisparityMap, rig: RectifiedRig) -> DisparityMap:
-    """Decode a map of ``rig``, the rectified rig in the answer to the stream's opening.
+def received_planes_from_proto(message: pb.DisparityMap, rig: RectifiedRig) -> ReceivedPlanes:
+    """Decode the planes of a map of ``rig`` as they were sent, every step-th pixel.
 
-    Raises BadShape: a plane has another size than the rig, or the origin is unknown.
+    Raises BadShape: a plane has another size than the rig, reduced by the map's step, or the step
+    is not 1, 2 or 4.
     Raises BadImage: a plane is not whole, or not of the stated encoding, compression and size.
-    Raises BadPose: the pose is not finite, or its quaternion is not of unit length.
     """
+    step = check_map_step(message.map_step or 1)
+    size = reduced((rig.width, rig.height), step)
     for name in ("disparity", "confidence", "sigma"):
         plane: pb.Plane = getattr(message, name)
         wanted = name == "disparity" or message.HasField(name)
-        if wanted and (plane.width, plane.height) != (rig.width, rig.height):
+        if wanted and (plane.width, plane.height) != size:
             raise BadShape(
-                f"expected a {name} plane of {rig.width}x{rig.height}, the stream's rig, "
-                f"got {plane.width}x{plane.height}"
+                f"expected a {name} plane of {size[0]}x{size[1]}, for the stream's rig and a step "
+                f"of {step}, got {plane.width}x{plane.height}"
             )
-    return DisparityMap(
-        frame_id=message.frame_id,
-        capture_ns=message.capture_ns,
-        rig=rig,
+    return ReceivedPlanes(
+        step=step,
         disparity_px=plane_from_proto(message.disparity),
         sigma_px=plane_from_proto(message.sigma) if message.HasField("sigma") else None,
         confidence=bytes_plane_from_proto(message.confidence)
         if message.HasField("confidence")
         else None,
+    )
+
+
+def disparity_from_proto(
+    message: pb.DisparityMap, rig: RectifiedRig, received: ReceivedPlanes | None = None
+) -> DisparityMap:
+    """Decode a map of ``rig``, the rectified rig in the answer to the stream's opening.
+
+    The map has the size of the rig, also if fewer pixels were sent. ``received`` are its planes, if
+    the caller has decoded them already.
+
+    Raises BadShape: a plane has another size than the rig, reduced by the map's step, or the origin
+    is unknown.
+    Raises BadImage: a plane is not whole, or not of the stated encoding, compression and size.
+    Raises BadPose: the pose is not finite, or its quaternion is not of unit length.
+    """
+    received = received or received_planes_from_proto(message, rig)
+    step, size, sigma_px = received.step, (rig.width, rig.height), received.sigma_px
+    confidence = received.confidence
+    return DisparityMap(
+        frame_id=message.frame_id,
+        capture_ns=message.capture_ns,
+        rig=rig,
+        disparity_px=widen_plane(received.disparity_px, step, size),
+        sigma_px=None if sigma_px is None else widen_plane(sigma_px, step, size),
+        confidence=None if confidence is None else widen_bytes(confidence, step, size),
         world_from_left=pose_from_proto(message.world_from_left)
         if message.HasField("world_from_left")
         else None,
@@ -204,10 +262,15 @@ def disparity_from_proto(message: pb.DisparityMap, rig: RectifiedRig) -> Dispari
 
 
 def output_format_to_proto(output: OutputFormat) -> pb.OutputFormat:
-    """Encode the format. Raises BadShape: the denominator is not 16 to 64."""
+    """Encode the format. Raises BadShape: the denominator is not 4 to 64, or the step not 1, 2, 4.
+
+    Zeros become the values for exact messages; see :meth:`OutputFormat.resolved`.
+    """
+    output = output.resolved()
     return pb.OutputFormat(
         encoding=number_of(DISPARITY_ENCODING, output.encoding),
         denominator=check_denominator(output.denominator),
+        map_step=check_map_step(output.map_step),
         compression=number_of(COMPRESSED, output.compressed),
         confidence=output.confidence,
         sigma=output.sigma,
@@ -215,13 +278,16 @@ def output_format_to_proto(output: OutputFormat) -> pb.OutputFormat:
 
 
 def output_format_from_proto(message: pb.OutputFormat) -> OutputFormat:
-    """Decode the format; an unspecified field becomes the default of :class:`OutputFormat`.
+    """Decode the format; unspecified fields have the values for exact messages.
 
-    Raises BadShape: the denominator is not 16 to 64, or depth.proto has no such number.
+    Raises BadShape: the denominator is not 4 to 64, the step is not 1, 2 or 4, or depth.proto has
+    no such number.
     """
+    exact = OutputFormat().resolved()
     return OutputFormat(
         encoding=value_of(DISPARITY_ENCODING, message.encoding, "output encoding"),
-        denominator=check_denominator(message.denominator or OutputFormat().denominator),
+        denominator=check_denominator(message.denominator or exact.denominator),
+        map_step=check_map_step(message.map_step or exact.map_step),
         compressed=value_of(COMPRESSED, message.compression, "output compression"),
         confidence=message.confidence,
         sigma=message.sigma,

@@ -38,13 +38,7 @@ def image_to_wire(
     A piece may be a view of the image itself.
     Raises BadImage: the image has another type or shape, is empty, or does not fit the encoding.
     """
-    if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)):
-        raise BadImage(
-            f"expected uint8 [H, W, 3] RGB or [H, W] grey, got {image.dtype} {list(image.shape)}"
-        )
-    height, width = image.shape[:2]
-    if height == 0 or width == 0:
-        raise BadImage(f"expected an image, got {width}x{height} pixels")
+    height, width = check_image(image).shape[:2]
     match encoding:
         case ImageEncoding.RAW:
             kind = pb.IMAGE_ENCODING_MONO8 if image.ndim == 2 else pb.IMAGE_ENCODING_RGB8
@@ -57,6 +51,21 @@ def image_to_wire(
             data = _encoded(image, ".png", [cv2.IMWRITE_PNG_COMPRESSION, 1])  # 1: the quickest
     header = pb.Image(encoding=kind, width=width, height=height)
     return [header.SerializeToString(), *delimited(pb.Image.DATA_FIELD_NUMBER, data)]
+
+
+def check_image(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the image unchanged.
+
+    Raises BadImage: it is not uint8 [H, W, 3] or [H, W], or it is empty.
+    """
+    if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)):
+        raise BadImage(
+            f"expected uint8 [H, W, 3] RGB or [H, W] grey, got {image.dtype} {list(image.shape)}"
+        )
+    height, width = image.shape[:2]
+    if height == 0 or width == 0:
+        raise BadImage(f"expected an image, got {width}x{height} pixels")
+    return image
 
 
 def image_from_proto(message: pb.Image, data: Piece | None = None) -> Image:

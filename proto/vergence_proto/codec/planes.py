@@ -40,12 +40,13 @@ _WIRE_TYPES: dict[int, np.dtype[Any]] = {
 
 
 def plane_to_proto(plane: Plane, output: OutputFormat, *, into: pb.Plane | None = None) -> pb.Plane:
-    """Encode float32 [H, W], NaN where there is no value, in the format ``output``.
+    """Encode float32 [H, W], NaN where there is no value, in the format ``output``, at full size.
 
     UINT16 has no zero and no negative numbers: a value below half a step becomes "no value". Values
     above 65535 / denominator saturate. ``into`` may be a field of a larger message, which saves a
     copy.
     """
+    output = output.resolved()
     match output.encoding:
         case PlaneEncoding.UINT16:
             kind = pb.PLANE_ENCODING_UINT16
@@ -97,9 +98,9 @@ def bytes_plane_from_proto(message: pb.Plane) -> NDArray[np.uint8]:
 
 
 def check_denominator(denominator: int) -> int:
-    """Return the denominator. Raises BadShape: it is not 16 to 64."""
-    if not 16 <= denominator <= 64:
-        raise BadShape(f"expected a denominator of 16 to 64, got {denominator}")
+    """Return the denominator. Raises BadShape: it is not 4 to 64."""
+    if not 4 <= denominator <= 64:
+        raise BadShape(f"expected a denominator of 4 to 64, got {denominator}")
     return denominator
 
 

@@ -164,7 +164,7 @@ class OpenStream(_message.Message):
     def __init__(self, stream_id: _Optional[str] = ..., resume_token: _Optional[bytes] = ..., rig: _Optional[_Union[StereoRig, _Mapping[str, _Any]]] = ..., axes: _Optional[_Union[Axes, str]] = ..., delivery: _Optional[_Union[Delivery, str]] = ..., output: _Optional[_Union[OutputFormat, _Mapping[str, _Any]]] = ..., iterations: _Optional[int] = ..., cold_iterations: _Optional[int] = ..., weights_sha256: _Optional[str] = ..., opening_id: _Optional[bytes] = ...) -> None: ...
 
 class StreamOpened(_message.Message):
-    __slots__ = ("stream_id", "resume_token", "credit", "rig", "model", "resumed", "detach_grace_s", "idle_timeout_s", "last_frame_id", "silent_s")
+    __slots__ = ("stream_id", "resume_token", "credit", "rig", "model", "resumed", "detach_grace_s", "idle_timeout_s", "last_frame_id", "silent_s", "max_frame_scale")
     STREAM_ID_FIELD_NUMBER: _ClassVar[int]
     RESUME_TOKEN_FIELD_NUMBER: _ClassVar[int]
     CREDIT_FIELD_NUMBER: _ClassVar[int]
@@ -175,6 +175,7 @@ class StreamOpened(_message.Message):
     IDLE_TIMEOUT_S_FIELD_NUMBER: _ClassVar[int]
     LAST_FRAME_ID_FIELD_NUMBER: _ClassVar[int]
     SILENT_S_FIELD_NUMBER: _ClassVar[int]
+    MAX_FRAME_SCALE_FIELD_NUMBER: _ClassVar[int]
     stream_id: str
     resume_token: bytes
     credit: int
@@ -185,23 +186,26 @@ class StreamOpened(_message.Message):
     idle_timeout_s: float
     last_frame_id: int
     silent_s: float
-    def __init__(self, stream_id: _Optional[str] = ..., resume_token: _Optional[bytes] = ..., credit: _Optional[int] = ..., rig: _Optional[_Union[RectifiedRig, _Mapping[str, _Any]]] = ..., model: _Optional[_Union[ModelInfo, _Mapping[str, _Any]]] = ..., resumed: bool = ..., detach_grace_s: _Optional[float] = ..., idle_timeout_s: _Optional[float] = ..., last_frame_id: _Optional[int] = ..., silent_s: _Optional[float] = ...) -> None: ...
+    max_frame_scale: int
+    def __init__(self, stream_id: _Optional[str] = ..., resume_token: _Optional[bytes] = ..., credit: _Optional[int] = ..., rig: _Optional[_Union[RectifiedRig, _Mapping[str, _Any]]] = ..., model: _Optional[_Union[ModelInfo, _Mapping[str, _Any]]] = ..., resumed: bool = ..., detach_grace_s: _Optional[float] = ..., idle_timeout_s: _Optional[float] = ..., last_frame_id: _Optional[int] = ..., silent_s: _Optional[float] = ..., max_frame_scale: _Optional[int] = ...) -> None: ...
 
 class Frame(_message.Message):
-    __slots__ = ("frame_id", "capture_ns", "left", "right", "pose", "max_age_s")
+    __slots__ = ("frame_id", "capture_ns", "left", "right", "pose", "max_age_s", "scale")
     FRAME_ID_FIELD_NUMBER: _ClassVar[int]
     CAPTURE_NS_FIELD_NUMBER: _ClassVar[int]
     LEFT_FIELD_NUMBER: _ClassVar[int]
     RIGHT_FIELD_NUMBER: _ClassVar[int]
     POSE_FIELD_NUMBER: _ClassVar[int]
     MAX_AGE_S_FIELD_NUMBER: _ClassVar[int]
+    SCALE_FIELD_NUMBER: _ClassVar[int]
     frame_id: int
     capture_ns: int
     left: Image
     right: Image
     pose: PoseSample
     max_age_s: float
-    def __init__(self, frame_id: _Optional[int] = ..., capture_ns: _Optional[int] = ..., left: _Optional[_Union[Image, _Mapping[str, _Any]]] = ..., right: _Optional[_Union[Image, _Mapping[str, _Any]]] = ..., pose: _Optional[_Union[PoseSample, _Mapping[str, _Any]]] = ..., max_age_s: _Optional[float] = ...) -> None: ...
+    scale: int
+    def __init__(self, frame_id: _Optional[int] = ..., capture_ns: _Optional[int] = ..., left: _Optional[_Union[Image, _Mapping[str, _Any]]] = ..., right: _Optional[_Union[Image, _Mapping[str, _Any]]] = ..., pose: _Optional[_Union[PoseSample, _Mapping[str, _Any]]] = ..., max_age_s: _Optional[float] = ..., scale: _Optional[int] = ...) -> None: ...
 
 class Reset(_message.Message):
     __slots__ = ()
@@ -256,7 +260,7 @@ class FramesDropped(_message.Message):
     def __init__(self, frame_ids: _Optional[_Iterable[int]] = ...) -> None: ...
 
 class DisparityMap(_message.Message):
-    __slots__ = ("frame_id", "capture_ns", "disparity", "confidence", "sigma", "world_from_left", "origin", "step_count", "iterations", "frames_skipped", "timings", "max_disparity_px")
+    __slots__ = ("frame_id", "capture_ns", "disparity", "confidence", "sigma", "world_from_left", "origin", "step_count", "iterations", "frames_skipped", "timings", "max_disparity_px", "map_step")
     FRAME_ID_FIELD_NUMBER: _ClassVar[int]
     CAPTURE_NS_FIELD_NUMBER: _ClassVar[int]
     DISPARITY_FIELD_NUMBER: _ClassVar[int]
@@ -269,6 +273,7 @@ class DisparityMap(_message.Message):
     FRAMES_SKIPPED_FIELD_NUMBER: _ClassVar[int]
     TIMINGS_FIELD_NUMBER: _ClassVar[int]
     MAX_DISPARITY_PX_FIELD_NUMBER: _ClassVar[int]
+    MAP_STEP_FIELD_NUMBER: _ClassVar[int]
     frame_id: int
     capture_ns: int
     disparity: Plane
@@ -281,7 +286,8 @@ class DisparityMap(_message.Message):
     frames_skipped: int
     timings: Timings
     max_disparity_px: float
-    def __init__(self, frame_id: _Optional[int] = ..., capture_ns: _Optional[int] = ..., disparity: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., confidence: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., sigma: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., world_from_left: _Optional[_Union[Pose, _Mapping[str, _Any]]] = ..., origin: _Optional[_Union[Origin, str]] = ..., step_count: _Optional[int] = ..., iterations: _Optional[int] = ..., frames_skipped: _Optional[int] = ..., timings: _Optional[_Union[Timings, _Mapping[str, _Any]]] = ..., max_disparity_px: _Optional[float] = ...) -> None: ...
+    map_step: int
+    def __init__(self, frame_id: _Optional[int] = ..., capture_ns: _Optional[int] = ..., disparity: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., confidence: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., sigma: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., world_from_left: _Optional[_Union[Pose, _Mapping[str, _Any]]] = ..., origin: _Optional[_Union[Origin, str]] = ..., step_count: _Optional[int] = ..., iterations: _Optional[int] = ..., frames_skipped: _Optional[int] = ..., timings: _Optional[_Union[Timings, _Mapping[str, _Any]]] = ..., max_disparity_px: _Optional[float] = ..., map_step: _Optional[int] = ...) -> None: ...
 
 class Timings(_message.Message):
     __slots__ = ("decode_us", "queue_us", "model_us", "encode_us", "total_us")
@@ -326,18 +332,20 @@ class Plane(_message.Message):
     def __init__(self, encoding: _Optional[_Union[PlaneEncoding, str]] = ..., compression: _Optional[_Union[Compression, str]] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., data: _Optional[bytes] = ..., denominator: _Optional[int] = ...) -> None: ...
 
 class OutputFormat(_message.Message):
-    __slots__ = ("encoding", "denominator", "compression", "confidence", "sigma")
+    __slots__ = ("encoding", "denominator", "compression", "confidence", "sigma", "map_step")
     ENCODING_FIELD_NUMBER: _ClassVar[int]
     DENOMINATOR_FIELD_NUMBER: _ClassVar[int]
     COMPRESSION_FIELD_NUMBER: _ClassVar[int]
     CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
     SIGMA_FIELD_NUMBER: _ClassVar[int]
+    MAP_STEP_FIELD_NUMBER: _ClassVar[int]
     encoding: PlaneEncoding
     denominator: int
     compression: Compression
     confidence: bool
     sigma: bool
-    def __init__(self, encoding: _Optional[_Union[PlaneEncoding, str]] = ..., denominator: _Optional[int] = ..., compression: _Optional[_Union[Compression, str]] = ..., confidence: bool = ..., sigma: bool = ...) -> None: ...
+    map_step: int
+    def __init__(self, encoding: _Optional[_Union[PlaneEncoding, str]] = ..., denominator: _Optional[int] = ..., compression: _Optional[_Union[Compression, str]] = ..., confidence: bool = ..., sigma: bool = ..., map_step: _Optional[int] = ...) -> None: ...
 
 class Vector3(_message.Message):
     __slots__ = ("x", "y", "z")

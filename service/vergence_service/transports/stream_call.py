@@ -207,6 +207,7 @@ class DepthCall:
             idle_timeout_s=self._engine.streams.idle_timeout_s,
             last_frame_id=stream.last_frame_id,
             silent_s=self._limits.silent_s,
+            max_frame_scale=codec.MAX_FRAME_SCALE,
         )
 
     async def _read(self, stream: Stream, mailbox: Mailbox) -> None:
@@ -273,6 +274,7 @@ class DepthCall:
         await self._outbox.put(pb.StreamDepthResponse(frames_dropped=dropped))
 
     async def _step(self, stream: Stream, mailbox: Mailbox) -> None:
+        size = stream.rectifier.rig.width, stream.rectifier.rig.height
         while True:
             await self._outbox.reserve_map()
             queued = await mailbox.take()
@@ -284,7 +286,7 @@ class DepthCall:
                     await self._engine.reset(stream.stream_id)
                 stepped = await self._engine.step(
                     stream.stream_id,
-                    partial(codec.decode_frame, queued.frame),
+                    partial(codec.decode_frame, queued.frame, size=size),
                     arrived_s=queued.arrived_s,
                     max_age_s=fields.max_age_s if fields.HasField("max_age_s") else None,
                 )
