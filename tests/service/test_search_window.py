@@ -36,17 +36,16 @@ def test_a_point_is_found_at_its_disparity_wherever_the_principal_points_are(
     if not 0 <= right_column < WIDTH - 1:
         return
     left, right = window.images(stroke(column), stroke(right_column))
-    shown = np.flatnonzero(right[0, :, 0])
-    if not 0 <= right_column + window.right_shift_px < WIDTH:
-        return  # moved out of the image, with all that is beyond the range
-    offset_px = column - float(shown[0])
-    # The image moves by whole pixels; a stroke has no fractions.
-    assert -0.5 <= offset_px - disparity_px <= 1.5
-    answer = np.full((HEIGHT, WIDTH), offset_px, np.float32)
+    # A match inside the image stays inside it.
+    at_left, at_right = (int(np.flatnonzero(image[0, :, 0])[0]) for image in (left, right))
+    assert at_left == column + window.left_shift_px
+    # The images move by whole pixels; a stroke has no fractions.
+    assert -0.5 <= at_left - at_right - disparity_px <= 1.5
+    answer = np.full(left.shape[:2], at_left - at_right, np.float32)
     found = window.disparity_px(answer, HEIGHT, WIDTH)
+    assert found.shape == (HEIGHT, WIDTH)
     if disparity_px > 1:
         np.testing.assert_allclose(found, disparity_px, atol=0.51)
-    np.testing.assert_array_equal(left, stroke(column))
 
 
 @given(st.floats(-300, 300))

@@ -7,7 +7,7 @@ from vergence_proto.errors import BadCalibration, FrameTooLarge
 from vergence_proto.types import StereoRig
 from vergence_service.inference.model import StereoModel, state_bytes
 from vergence_service.memory import StreamMemory
-from vergence_service.streams.search_window import SearchReach
+from vergence_service.streams.search_window import SearchReach, SearchWindow
 
 # Smaller images have nothing to match. The network would still see them as wide as its search.
 _LEAST_SIDE = 16
@@ -50,12 +50,17 @@ def stream_memory(
 ) -> StreamMemory:
     """Return the memory that a stream of this rig needs."""
     width, height = rig.left.width, rig.left.height
-    reduction = reach.reduction(width)
-    rows, columns = -(-height // reduction), -(-width // reduction)
+    rectified = rig.as_rectified()
+    if rectified is None:  # then zero disparity is at offset 0, and nothing is moved
+        reduction = reach.reduction(width)
+        rows, columns = -(-height // reduction), -(-width // reduction)
+    else:
+        searched = SearchWindow.of(rectified, reach).rig
+        rows, columns = searched.height, searched.width
     steps: Iterable[tuple[int, bool]] = ((warm_iterations, False), (cold_iterations, True))
     return StreamMemory(
         state=state_bytes(model.card, rows, columns),
         work=_WORK_BYTES_A_PIXEL * width * height,
-        maps=0 if rig.as_rectified() else _MAP_BYTES_A_PIXEL * width * height,
+        maps=0 if rectified else _MAP_BYTES_A_PIXEL * width * height,
         step=max(model.step_bytes(rows, columns, count, cold=cold) for count, cold in steps),
     )

@@ -27,35 +27,45 @@ class SearchReach:
 class SearchWindow:
     """The images of one rig as the model sees them, and its answer in the rig's own pixels.
 
-    The model searches from offset 0. So the right image is moved by whole pixels to make that
-    disparity 0: cameras whose principal points differ lose no range. And where its range would be
-    a small share of a wide image, the image is reduced by a whole factor.
+    The model searches from offset 0. So one image is moved to the right by whole pixels to make
+    that disparity 0: cameras whose principal points differ lose no range. If it is the left one,
+    the images grow wider, because nothing of it may be lost. And where the range would be a small
+    share of a wide image, the image is reduced by a whole factor.
     """
 
     rig: RectifiedRig  # of the images that the model sees
+    left_shift_px: int
     right_shift_px: int
     reduction: int
     max_disparity_px: float  # in the rig's own pixels
 
     @classmethod
     def of(cls, rig: RectifiedRig, reach: SearchReach) -> Self:
-        shift = math.floor(rig.offset_of_zero_disparity_px)
+        zero_px = math.floor(rig.offset_of_zero_disparity_px)
+        # Farther apart than their width, images share no point but one beyond the range.
+        left_shift = min(max(0, -zero_px), rig.width)
+        right_shift = max(0, zero_px)
         reduction = reach.reduction(rig.width)
-        shifted = replace(rig, cx_right=rig.cx_right + shift)
+        shifted = replace(
+            rig,
+            width=rig.width + left_shift,
+            cx_left=rig.cx_left + left_shift,
+            cx_right=rig.cx_right + right_shift,
+        )
         beyond_zero_px = shifted.offset_of_zero_disparity_px
         return cls(
             _reduced(shifted, reduction),
-            shift,
+            left_shift,
+            right_shift,
             reduction,
             reach.max_disparity_px * reduction - beyond_zero_px,
         )
 
     def images(self, left: Image, right: Image) -> tuple[Image, Image]:
         """The images as the model sees them, from uint8 [H, W, C] of the rig's size."""
-        if self.right_shift_px:
-            width = right.shape[1]
-            columns = np.arange(width) - self.right_shift_px
-            right = right[:, columns.clip(0, width - 1)]  # the image's edge repeats
+        width = left.shape[1] + self.left_shift_px
+        left = _moved(left, self.left_shift_px, width)
+        right = _moved(right, self.right_shift_px, width)
         return self._smaller(left), self._smaller(right)
 
     def disparity_px(self, offset_px: Plane, height: int, width: int) -> Plane:
@@ -79,11 +89,20 @@ class SearchWindow:
         return np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA), np.uint8)
 
     def _enlarged(self, plane: Plane, height: int, width: int) -> Plane:
+        columns = slice(self.left_shift_px, self.left_shift_px + width)
         if self.reduction == 1:
-            return plane
+            return plane[:, columns]
         size = (self.rig.width * self.reduction, self.rig.height * self.reduction)
         larger = cv2.resize(plane, size, interpolation=cv2.INTER_LINEAR)
-        return np.asarray(larger[:height, :width] * np.float32(self.reduction), np.float32)
+        return np.asarray(larger[:height, columns] * np.float32(self.reduction), np.float32)
+
+
+def _moved(image: Image, shift_px: int, width: int) -> Image:
+    """The image moved to the right, of that width; its edges repeat."""
+    if shift_px == 0 and width == image.shape[1]:
+        return image
+    columns = np.arange(width) - shift_px
+    return image[:, columns.clip(0, image.shape[1] - 1)]
 
 
 def _reduced(rig: RectifiedRig, factor: int) -> RectifiedRig:
