@@ -15,7 +15,6 @@ from torch import nn
 
 from tests.support.trained import as_trained
 from vergence_models.config import Config, LiteNetworkConfig, StepKind
-from vergence_models.evaluate import WEIGHTS
 from vergence_models.evaluation.stepping import OnnxNetwork, StepInputs
 from vergence_models.export import (
     PARITY_PX,
@@ -35,11 +34,6 @@ HEIGHT, WIDTH = 192, 256
 def network() -> LiteNetwork:
     torch.manual_seed(3)
     return as_trained(LiteNetwork(LiteNetworkConfig()))
-
-
-@pytest.fixture(scope="module")
-def shipped() -> OnnxNetwork:
-    return OnnxNetwork(WEIGHTS, "lite", threads=2)
 
 
 def views(seed: int) -> tuple[torch.Tensor, torch.Tensor]:

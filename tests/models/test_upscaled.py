@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from vergence_models.config import FAST_NETWORK, LiteNetworkConfig
-from vergence_models.evaluate import WEIGHTS
 from vergence_models.evaluation.stepping import OnnxNetwork, StepInputs
 from vergence_models.networks.base import StepOutput
 from vergence_models.networks.lite.network import LiteNetwork
@@ -104,7 +103,7 @@ def test_a_tier_without_2x_refinement_says_so() -> None:
         network.cold_step(image, image, 2, at_2x=1)
 
 
-def test_2x_refinement_finds_bars_that_are_thinner_than_a_cell() -> None:
+def test_2x_refinement_finds_bars_that_are_thinner_than_a_cell(shipped: OnnxNetwork) -> None:
     wall_px, bar_px, width = 6, 16, 3
     random = np.random.default_rng(11)
     left, right = (np.zeros((192, 256, 3), np.uint8) for _ in range(2))
@@ -116,9 +115,8 @@ def test_2x_refinement_finds_bars_that_are_thinner_than_a_cell() -> None:
         left[:, column : column + width] = bar
         right[:, column - bar_px : column - bar_px + width] = bar
         truth[:, column : column + width] = bar_px
-    network = OnnxNetwork(WEIGHTS, "lite")
-    still, nothing = np.eye(4, dtype=np.float32)[None], network.cold_state(192, 256)
-    plain, *_ = network.run(StepInputs(left[None], right[None], still, nothing), 8)
-    at_2x, *_ = network.start(left[None], right[None], 8)
+    still, nothing = np.eye(4, dtype=np.float32)[None], shipped.cold_state(192, 256)
+    plain, *_ = shipped.run(StepInputs(left[None], right[None], still, nothing), 8)
+    at_2x, *_ = shipped.start(left[None], right[None], 8)
     missed = [np.mean(np.abs(each[0] - truth)[truth == bar_px] > 2) for each in (plain, at_2x)]
     assert missed[1] < missed[0]
