@@ -15,6 +15,7 @@ from tests.support.models import NOT_FINITE, RecallModel
 from tests.support.sequences import make_frames, sequence_files, write_sequence, zip_bytes
 from tests.support.server import running_server
 from tests.support.textured_wall import write_wall
+from tests.support.weights_copy import WEIGHTS
 from vergence.cli.batch import batch
 from vergence.cli.errors import CliError
 
@@ -91,7 +92,11 @@ async def test_what_holds_no_sequence_is_told_before_anything_is_sent(
 def test_the_command_starts_a_server_of_its_own_and_writes_pictures(tmp_path: Path) -> None:
     wall = write_wall(tmp_path / "wall", frames=2)
     outputs = ("--output", "disparity", "--output", "depth", "--metrics")
-    done = vergence("batch", wall, "--out", tmp_path / "out", *outputs)
+    done = vergence(
+        *("batch", wall, "--out", tmp_path / "out", *outputs),
+        VERGENCE_MODEL__WEIGHTS=str(WEIGHTS),
+        VERGENCE_MODEL__NAME="whole",  # loaded at once
+    )
     assert done.returncode == 0, done.stderr
     assert "wall" in done.stdout
     for kind in ("disparity", "depth"):

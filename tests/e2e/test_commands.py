@@ -25,6 +25,7 @@ from tests.support.textured_wall import (
     write_pair,
     write_wall,
 )
+from tests.support.weights_copy import WEIGHTS
 from vergence_proto.instruction_set import instruction_set
 
 PATIENCE_S = 60.0
@@ -123,7 +124,11 @@ def test_run_writes_every_frame_losslessly(wall: Path, server: str, tmp_path: Pa
 
 def test_run_takes_a_lone_pair_and_starts_a_server_for_it(tmp_path: Path) -> None:
     pair = write_pair(tmp_path / "pair")
-    done = vergence("run", f"vergence:{pair}", "--out", tmp_path / "out", "--json", tmp_path / "j")
+    done = vergence(
+        *("run", f"vergence:{pair}", "--out", tmp_path / "out", "--json", tmp_path / "j"),
+        VERGENCE_MODEL__WEIGHTS=str(WEIGHTS),
+        VERGENCE_MODEL__NAME="whole",  # loaded at once
+    )
     assert done.returncode == 0, done.stderr
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["disp.png", "rig.json"]
     assert json.loads((tmp_path / "j").read_text())["epe_px"] is None  # the pair has no truth
