@@ -1,6 +1,7 @@
 """The progress of jobs: of one run, and as clients see it."""
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from vergence_service.jobs.job import Job
@@ -10,9 +11,15 @@ from vergence_service.jobs.job import Job
 class JobProgress:
     """The progress of one run of a job."""
 
+    on_progress: Callable[[], None] = lambda: None
     since_s: float = field(default_factory=time.monotonic)
     frames_found: int = 0  # frames that earlier runs have done
     frames_done: int = 0  # all frames done, those of earlier runs included
+
+    def advance(self, frames_done: int) -> None:
+        """Record that so many frames are done."""
+        self.frames_done = frames_done
+        self.on_progress()
 
     @property
     def elapsed_s(self) -> float:

@@ -24,6 +24,7 @@ from vergence_service.threads import ThreadPool, to_the_end
 
 # The expected duration of a job before any has run. Clients are asked to retry after it.
 _USUAL_JOB_S = 2.0
+_PROGRESS_EVERY_S = 0.25
 
 
 class JobRegistry:
@@ -43,7 +44,8 @@ class JobRegistry:
         self._jobs: dict[str, Job] = {}
         self._running: dict[str, JobProgress] = {}
         self._readers: Counter[str] = Counter()
-        self._changed = asyncio.Condition()
+        self._changed = asyncio.Event()  # set at a change, and then replaced
+        self._progress_due: asyncio.TimerHandle | None = None
         self._last_job_s = _USUAL_JOB_S
 
     async def load(self) -> None:
@@ -113,12 +115,12 @@ class JobRegistry:
             self._readers[job_id] -= 1
 
     async def change(self, *, within_s: float) -> None:
-        """Wait until a job begins, ends or is deleted, but at most ``within_s``."""
-        async with self._changed:
-            try:
-                await asyncio.wait_for(self._changed.wait(), within_s)
-            except TimeoutError:
-                return
+        """Wait until a job begins, ends, is deleted or progresses, but at most ``within_s``.
+
+        Progress is reported a few times a second, however fast it is.
+        """
+        with suppress(TimeoutError):
+            await asyncio.wait_for(self._changed.wait(), within_s)
 
     def usual_job_s(self) -> float:
         """Estimate the time until the queue has a free place."""
@@ -143,34 +145,34 @@ class JobRegistry:
         await self._background.finish(flushing(folder))
         await self._background.run(self._store.insert, folder, job)
         self._jobs[job.job_id] = job
-        await self._notify_changed()
+        self._notify_changed()
 
     def begin_run(self, job_id: str) -> JobProgress:
         """Record that the worker runs a job; return the progress of the run, for it to update."""
-        progress = self._running[job_id] = JobProgress()
+        progress = self._running[job_id] = JobProgress(on_progress=self._notify_soon)
         return progress
 
     def end_stepping(self, job_id: str) -> None:
         """Record that the model is free again."""
         self._last_job_s = self._running[job_id].elapsed_s
 
-    async def end_run(self, job_id: str) -> None:
+    def end_run(self, job_id: str) -> None:
         """Record that the worker does nothing more for a job, or begins with it again."""
         del self._running[job_id]
-        await self._notify_changed()
+        self._notify_changed()
 
     async def update(self, job: Job) -> None:
         """Replace the entry of a job, unless it was deleted."""
         await self._background.run(self._store.update, job)
         if job.job_id in self._jobs:
             self._jobs[job.job_id] = job
-            await self._notify_changed()
+            self._notify_changed()
 
     async def keep_waiting(self, job: Job) -> None:
         """Record why a job waits: here, and on the disk if it can be written."""
         if job.job_id in self._jobs:
             self._jobs[job.job_id] = job
-            await self._notify_changed()
+            self._notify_changed()
         try:
             await self._background.run(self._store.update, job)
         except Exception as error:
@@ -197,7 +199,7 @@ class JobRegistry:
         on_kept()
         if job.job_id in self._jobs:
             self._jobs[job.job_id] = job
-            await self._notify_changed()
+            self._notify_changed()
         # Only now: a server that is killed before the row is written needs the input again.
         await self._background.run(self._store.tidy, job)
 
@@ -210,7 +212,7 @@ class JobRegistry:
         """Delete a job with its row and its files."""
         self._jobs.pop(job_id, None)
         await self._background.run(self._store.delete, job_id)
-        await self._notify_changed()
+        self._notify_changed()
 
     # Limits of age and disk space.
 
@@ -282,9 +284,18 @@ class JobRegistry:
     def _removable(self) -> list[Job]:
         return [job for job in self._jobs.values() if job.ended and not self._readers[job.job_id]]
 
-    async def _notify_changed(self) -> None:
-        async with self._changed:
-            self._changed.notify_all()
+    def _notify_changed(self) -> None:
+        self._changed.set()
+        self._changed = asyncio.Event()
+
+    def _notify_soon(self) -> None:
+        if self._progress_due is None:
+            loop = asyncio.get_running_loop()
+            self._progress_due = loop.call_later(_PROGRESS_EVERY_S, self._notify_progress)
+
+    def _notify_progress(self) -> None:
+        self._progress_due = None
+        self._notify_changed()
 
 
 def _ended_up_s(job: Job) -> float:

@@ -118,7 +118,7 @@ async def run_job(
             async for stepped, found in written:
                 if found is not None:
                     measured.append(found)
-                progress.frames_done = stepped.index + 1
+                progress.advance(stepped.index + 1)
                 engine.metrics.sequence_frames.inc()
                 unsaved = stepped
                 if time.monotonic() >= checkpoint_due_s:

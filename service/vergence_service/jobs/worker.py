@@ -115,7 +115,7 @@ class JobWorker:
             await self._wait_out(job, error)
         finally:
             del self._runs[job.job_id]
-            await self._jobs.end_run(job.job_id)
+            self._jobs.end_run(job.job_id)
 
     async def _wait_out(self, job: Job, error: Exception) -> None:
         """Let a job wait whose run failed for no fault of its own.

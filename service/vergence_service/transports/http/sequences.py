@@ -30,7 +30,6 @@ from vergence_service.transports.http.uploads import (
 )
 
 _FILM_FPS = 30.0  # frame rate of a film whose sequence does not state one
-_POLL_EVERY_S = 0.25
 # Proxies close connections that are silent for longer than about this.
 _SILENCE_S = 15.0
 
@@ -207,7 +206,7 @@ def sequence_routes(
         job_id = status.job.job_id
         if query.wait:
             while not (status := jobs.status(job_id)).job.ended and not stopping.is_set():
-                await jobs.change(within_s=_POLL_EVERY_S)
+                await _change(jobs, stopping)
             if status.job.ended:
                 return await _result(jobs, job_id, query.format, threads)
         return JSONResponse(
@@ -284,12 +283,25 @@ async def _events(jobs: JobRegistry, job_id: str, stopping: asyncio.Event) -> As
         if status != reported:
             reported, spoken_s = status, loop.time()
             yield f"event: progress\ndata: {SequenceJob.of(status).model_dump_json()}\n\n"
-        elif loop.time() - spoken_s > _SILENCE_S:
+        elif loop.time() - spoken_s >= _SILENCE_S:
             spoken_s = loop.time()
             yield ": still here\n\n"
         if status.job.ended:
             return
-        await jobs.change(within_s=_POLL_EVERY_S)
+        await _change(jobs, stopping)
+
+
+async def _change(jobs: JobRegistry, stopping: asyncio.Event) -> None:
+    """Wait for a change of the jobs, for the server's end, or for the time to break the silence."""
+    waits = [
+        asyncio.create_task(jobs.change(within_s=_SILENCE_S)),
+        asyncio.create_task(stopping.wait()),
+    ]
+    try:
+        await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for wait in waits:
+            wait.cancel()
 
 
 async def _result(
