@@ -49,6 +49,12 @@ class Metrics:
         for decoder in ("jpeg", "png"):
             self.decoder_messages.labels(decoder)
         self.streams_open = Gauge("vergence_streams_open", "Open streams", registry=registry)
+        self.streams_opened = Counter(
+            "vergence_streams_opened", "Streams that were opened", registry=registry
+        )
+        self.streams_closed = Counter(
+            "vergence_streams_closed", "Streams that were closed or have expired", registry=registry
+        )
         self.streams_predicted = Gauge(
             "vergence_streams_predicted",
             "Live streams whose next frame is predicted",

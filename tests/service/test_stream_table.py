@@ -260,6 +260,11 @@ class StreamTableMachine(RuleBasedStateMachine):
             if owner is not None:
                 assert bool(owner.losses) == (owner in self.silent)
                 assert not owner.busy or self.table.idle_s(stream) == 0
+        opened, closed = (
+            self.registry.get_sample_value(f"vergence_streams_{what}_total")
+            for what in ("opened", "closed")
+        )
+        assert (opened, closed) == (len(self.opened), len(self.opened) - len(self.sizes))
         ended = [stream for stream in self.opened if stream not in self.streams.values()]
         assert sorted(map(id, self.closed)) == sorted(map(id, ended)), "each is reported once"
 

@@ -82,7 +82,7 @@ class JobRegistry:
         if job.ended or progress is None:
             done = job.frames if job.state is JobState.DONE else 0
             ahead = 0 if job.ended else self.unfinished().index(job)
-            return JobStatus(job, done, ahead, job.fps, None)
+            return JobStatus(job, done if job.ended else job.reached, ahead, job.fps, None)
         return JobStatus(
             job, progress.frames_done, 0, progress.fps or None, progress.eta_s(job.frames)
         )

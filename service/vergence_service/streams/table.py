@@ -148,6 +148,7 @@ class StreamTable:
             self._clock(),
         )
         self._streams[place.stream_id] = stream
+        self._metrics.streams_opened.inc()
         self._count()
         return stream
 
@@ -224,6 +225,7 @@ class StreamTable:
         """End a stream, and free its state and what was learnt about it."""
         if self._streams.get(stream.stream_id) is stream:
             del self._streams[stream.stream_id]
+            self._metrics.streams_closed.inc()
             stream.memory.release()
             if stream.attachment is not None:
                 self._leaving[stream.attachment] = stream.client

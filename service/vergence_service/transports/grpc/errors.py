@@ -1,5 +1,6 @@
 """Translate DepthError to gRPC: a status, with google.rpc.ErrorInfo for programs."""
 
+import asyncio
 import logging
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager, suppress
@@ -54,6 +55,7 @@ async def abort(context: Context, error: DepthError) -> None:
     trailing_metadata = rpc_status.to_status(status).trailing_metadata
     with suppress(grpc.aio.InternalError):  # the client is gone
         await context.abort(code, str(error), trailing_metadata)
+    raise asyncio.CancelledError  # gRPC takes it as the end of the call
 
 
 @asynccontextmanager
