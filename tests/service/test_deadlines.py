@@ -1,6 +1,7 @@
 """A client that is silent or slow costs little: each of its waits has a limit."""
 
 import asyncio
+import logging
 import os
 import resource
 import socket
@@ -85,6 +86,19 @@ async def test_a_grpc_call_without_a_first_message_is_ended(method: str) -> None
             await asyncio.wait_for(call.read(), PATIENCE_S)
     assert failure.value.code() is grpc.StatusCode.DEADLINE_EXCEEDED
     assert reason_of(failure.value) == "CLIENT_TIMEOUT"
+
+
+async def test_a_client_that_leaves_without_a_word_is_no_failure(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async with running_server(RecallModel()) as server, own_connection(server) as stub:
+        for _ in range(20):
+            call: Any = stub.StreamDepth()
+            await call.wait_for_connection()
+            await call.done_writing()
+            call.cancel()
+        await stub.GetServerInfo(pb.GetServerInfoRequest())
+    assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
 
 
 async def test_every_service_answers_behind_the_deadline() -> None:
