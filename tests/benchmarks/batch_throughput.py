@@ -1,18 +1,19 @@
-"""Whole sequences over HTTP against the bare model loop, and beside a live stream.
+"""Measure whole sequences over HTTP, against the bare model loop and beside a live stream.
 
     python tests/benchmarks/batch_throughput.py --json FILE
 
-Every round measures each of these once on the same sequence, so that they share the machine's
-moods; the benchmark prints medians.
+Every round measures each of these once on the same sequence, so that a busy moment of the machine
+hits all of them. The benchmark prints medians.
 
-- ``bare_fps``: the model loop in this process: read a frame from disk, step it, the next one.
-- ``memory_fps``: the same with all frames in memory, the most that the model can do.
-- ``batch_fps``: sequences in the queue of a real server process, from the first frame of the first
-  to the last of the last, all written to disk.
+- ``bare_fps``: frames per second of a loop in this process, which reads a frame from disk, steps it
+  and goes on to the next.
+- ``memory_fps``: the same loop with all frames in memory. The model cannot be faster.
+- ``batch_fps``: frames per second of sequences in the queue of a real server process, from the
+  first frame of the first sequence to the last of the last. All results are written to disk.
 - ``ratio``: batch_fps / bare_fps; ``memory_ratio``: batch_fps / memory_fps.
-- ``live_age_p95_ms``: from capture to result of a 15 Hz live stream over gRPC while the server
-  works through a batch; ``..._alone_...``: without one; ``..._first_half_...``,
-  ``..._second_half_...``: whether it grows. ``live_batch_fps``: what the batch still got.
+- ``live_age_p95_ms``: time from capture to result in a 15 Hz live stream over gRPC while the server
+  works through a batch. ``..._alone_...`` is without a batch. ``..._first_half_...`` and
+  ``..._second_half_...`` show whether it grows. ``live_batch_fps`` is what the batch got beside it.
 """
 
 import argparse
@@ -46,7 +47,7 @@ SEQUENCES = 2  # in the queue at once
 
 
 class BareLoop:
-    """What a script does that has the model and the frames."""
+    """Steps the model in a loop, as a script would that has the frames."""
 
     def __init__(self, rig: StereoRig, threads: int) -> None:
         rectified = rig.as_rectified()
@@ -101,7 +102,7 @@ async def submit(http: httpx.AsyncClient, archive: bytes) -> str:
 
 
 async def batch_fps(http: httpx.AsyncClient, archive: bytes, frames: int) -> float:
-    """Of sequences that wait in the queue; uploads are over before the clock starts."""
+    """Measure sequences that wait in the queue; they are uploaded before the clock starts."""
     warm = await submit(http, archive)  # the model is busy with it while the others are uploaded
     job_ids = [await submit(http, archive) for _ in range(SEQUENCES)]
     await ended(http, warm)
@@ -114,7 +115,7 @@ async def batch_fps(http: httpx.AsyncClient, archive: bytes, frames: int) -> flo
 
 
 async def ended(http: httpx.AsyncClient, job_id: str) -> dict[str, Any]:
-    """The job's last state, once it is reached."""
+    """Wait for the job's end, and return its last state."""
     job: dict[str, Any] = {}
     async with http.stream("GET", f"/v1/sequences/{job_id}/events") as events:
         async for line in events.aiter_lines():
@@ -127,10 +128,10 @@ async def ended(http: httpx.AsyncClient, job_id: str) -> dict[str, Any]:
 async def live_ages_s(
     server: str, rig: StereoRig, frames: list[SourceFrame], seconds: float
 ) -> list[float]:
-    """Of each answered frame of a live stream, in order."""
+    """Return the age of each answered frame of a live stream, in order."""
     pairs = [(each.frame.left, each.frame.right, each.frame.pose) for each in frames]
     async with DepthClient(f"grpc://{server}") as client, client.open_session(rig) as session:
-        await session.step(*pairs[0])  # the cold start is not what is asked
+        await session.step(*pairs[0])  # the cold start is not measured
 
         async def film() -> None:
             started_s = time.monotonic()

@@ -1,10 +1,10 @@
-"""Size and time of lossless compressions of a 16-bit disparity map, side by side.
+"""Compare lossless compressions of a 16-bit disparity map in size and time.
 
     python tests/benchmarks/codec_size.py --data DIR --json FILE
 
-DIR holds sequences in the ``vergence:`` layout; a smooth synthetic room stands in where none is
-given. ``wire`` is what the service sends. Optional codecs are measured where they are installed;
-``install_mb`` is what a codec adds to the thin client, its own dependencies included.
+DIR holds sequences in the ``vergence:`` layout. Without it, maps are of a smooth synthetic room.
+``wire`` is what the service sends. Optional codecs are measured if they are installed.
+``install_mb`` is what a codec adds to the thin client, with its own dependencies.
 """
 
 import argparse
@@ -36,7 +36,7 @@ else:
     ZSTD = "backports.zstd"
 
 Map = NDArray[np.uint16]
-Encode = Callable[[Map], Any]  # bytes, or what the codec calls bytes
+Encode = Callable[[Map], Any]  # bytes, or a type of the codec's own
 Decode = Callable[[Any], Any]
 
 REPEATS = 15
@@ -44,7 +44,7 @@ DENOMINATOR = 64
 
 
 def candidates(shape: tuple[int, int]) -> dict[str, tuple[str | None, Encode, Decode]]:
-    """Name -> (distribution that the base install lacks, encode, decode)."""
+    """Return name -> (distribution that the base install lacks, encode, decode)."""
     size = shape[0] * shape[1] * 2
     dtype = np.dtype("<u2")
 
@@ -117,13 +117,13 @@ def _imagecodecs(raw: Decode, shape: tuple[int, int]) -> tuple[Encode, Decode]:
 
 
 def real_maps(data_dir: Path, shape: tuple[int, int]) -> list[Map]:
-    """Every fourth true map of that size; pixels without truth keep their 0."""
+    """Read every fourth true map of that size; pixels without truth are 0."""
     maps = [np.load(path)["disp"] for path in sorted(data_dir.glob("*/frame_???[048]_gt.npz"))]
     return [m.astype("<u2") for m in maps if m.shape == shape]
 
 
 def synthetic_maps(shape: tuple[int, int]) -> list[Map]:
-    """Slanted planes with steps between them and a tenth of a pixel of smooth error."""
+    """Make slanted planes with steps between them and a tenth of a pixel of smooth error."""
     rng = np.random.default_rng(0)
     v, u = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
     maps = []
@@ -151,7 +151,7 @@ def median_ms(call: Callable[[Any], object], argument: object) -> float:
 
 
 def install_mb(name: str | None) -> float:
-    """What one distribution adds, its dependencies but for the base install's included."""
+    """Return what a distribution adds to the base install, with its dependencies, in MB."""
     base = _closure("numpy") | _closure("opencv-python-headless") | _closure("protobuf")
     added = _closure(name) - base if name else set()
     paths = [file.locate() for each in added for file in distribution(each).files or ()]
@@ -165,7 +165,7 @@ def _closure(name: str) -> set[str]:
         try:
             requires = distribution(current).requires or []
         except PackageNotFoundError:
-            continue  # of another platform
+            continue  # it is for another platform
         if current not in found:
             found.add(current)
             plain = [line for line in requires if "extra ==" not in line]

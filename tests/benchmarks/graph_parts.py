@@ -1,10 +1,11 @@
-"""One graph per iteration count against its parts run in turn: a step of full or fast.
+"""Compare a step of full or fast as one graph with its parts, run one after another.
 
     python tests/benchmarks/graph_parts.py --model fast --json FILE
 
-640x480, batch 1, fresh weights (times do not depend on them). The methods take turns, so that a
-busy moment of the machine hits all of them; medians in milliseconds. The bytes are of one graph
-per count with and without weights in a file of their own.
+Images are 640x480, the batch is 1, and the weights are new (times do not depend on them). The
+methods take turns, so that a busy moment of the machine hits all of them. Times are medians in
+milliseconds. The bytes are those of one graph per count, with and without weights in a file of
+their own.
 """
 
 import argparse
@@ -46,7 +47,7 @@ def session_of(graph: Path | bytes, threads: int) -> onnxruntime.InferenceSessio
 
 
 def in_turn(sessions: StepParts[onnxruntime.InferenceSession], feed: Feed, count: int) -> None:
-    """A step by its parts: what one hands over is an input of those that follow."""
+    """Run a step part by part: the outputs of a part are inputs of the parts after it."""
     tensors = dict(feed)
     for session in (*sessions.begin, *([sessions.iterate] * count), sessions.end):
         given = {entry.name: tensors[entry.name] for entry in session.get_inputs()}
@@ -60,7 +61,7 @@ def measure(methods: dict[str, Callable[[], object]], rounds: int) -> dict[str, 
         for name, run in methods.items():
             start = time.perf_counter()
             run()
-            if turn:  # the first warms up
+            if turn:  # the first turn warms up
                 times[name].append(1e3 * (time.perf_counter() - start))
     return {name: round(float(np.median(values)), 1) for name, values in times.items()}
 

@@ -1,14 +1,14 @@
-"""How many steps a server takes when several live streams want them at once. Linux.
+"""Measure how many steps a server takes for several live streams at once. Needs Linux.
 
     python tests/benchmarks/many_streams.py --json FILE
 
-A real server process with `lite` on the CPU, and for each count of streams as many sessions of the
-SDK, each with a camera of its own: 640x480, newest wins, over loopback gRPC. Per count:
+A real server process runs `lite` on the CPU. For each count of streams there are as many sessions
+of the SDK, each with a camera of its own: 640x480, newest wins, over loopback gRPC. Each row has:
 
 - ``steps_per_s``: answers to all streams together.
-- ``p50_ms p95_ms``: from capture to the moment a client has the map, over all streams.
-- ``least_pct``: the share of the stream that got the fewest, of what an equal share would be.
-- ``cpu_ms``: CPU time of the server per step, transport and codec included.
+- ``p50_ms p95_ms``: time from capture to the moment that a client has the map, over all streams.
+- ``least_pct``: the answers to the stream that got the fewest, in percent of an equal share.
+- ``cpu_ms``: CPU time of the server per step, with transport and codec.
 """
 
 import argparse
@@ -30,7 +30,7 @@ from vergence_service.inference.onnx_model import packaged_weights_dir
 
 RIG = RectifiedRig(640, 480, 500.0, 500.0, 319.5, 319.5, 239.5, 0.1)
 DISPARITY_PX = 12
-STAGGER_S = 0.013  # between the starts of two cameras: nobody's shutters are in step
+STAGGER_S = 0.013  # between the starts of two cameras, which are not synchronous
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class Server:
     pid: int
 
     def cpu_s(self) -> float:
-        """CPU time of all its threads until now."""
+        """Return the CPU time of all its threads until now."""
         fields = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")  # user, system
 
@@ -64,7 +64,7 @@ async def serving(weights: Path, threads: int) -> AsyncIterator[Server]:
 
 
 async def stream(address: str, *, rate_hz: float, starts_s: float, counted_s: float) -> list[float]:
-    """One camera and its reader. The ages of the maps that came in the counted time, in seconds."""
+    """Run a camera and its reader; return the ages in seconds of the maps of the counted time."""
     noise = np.random.default_rng(0).integers(0, 256, (480, 640 + DISPARITY_PX, 3), np.uint8)
     left, right = noise[:, :-DISPARITY_PX].copy(), noise[:, DISPARITY_PX:].copy()
     ages_s: list[float] = []
@@ -89,7 +89,7 @@ async def stream(address: str, *, rate_hz: float, starts_s: float, counted_s: fl
 async def together(
     server: Server, count: int, *, rate_hz: float, seconds: float
 ) -> dict[str, float]:
-    starts_s = time.monotonic() + 1.5  # streams run for a second before it: they open, and warm up
+    starts_s = time.monotonic() + 1.5  # before it, streams open and warm up for a second
     async with asyncio.TaskGroup() as tasks:
         streams = [
             tasks.create_task(

@@ -1,13 +1,13 @@
-"""What the service adds to its model: transport, codec and queueing, side by side in one run.
+"""Measure what the service adds to its model: transport, codec and queueing.
 
     python tests/benchmarks/service_overhead.py --json FILE
 
 Every round measures each of these once, so that all of them share the machine's load. The benchmark
 prints medians.
 
-- ``model_ms``: a warm step of the model in this process, nothing round it.
+- ``model_ms``: a warm step of the model in this process, with nothing around it.
 - ``service_ms``: the same step through the SDK, loopback gRPC and a real server process, one frame
-  at a time: from the arrays of the images to the array of the disparity.
+  at a time, from the arrays of the images to the array of the disparity.
 - ``overhead_ms``: ``service_ms - model_ms``.
 - ``bare_grpc_ms``: messages of the same sizes through a gRPC server that only echoes.
 - ``pipelined_ms``: time per frame with as many frames in flight as the credit allows.
@@ -46,7 +46,7 @@ Scene = list[tuple[Image, Image, Pose]]
 
 
 def make_scene(frames: int) -> Scene:
-    """A camera that moves along a textured wall: every frame is new, every warp is true."""
+    """Make frames of a camera that moves along a textured wall: each is new, each pose is true."""
     depth_m = RIG.fx * RIG.baseline_m / DISPARITY_PX
     step_px = round(RIG.fx * STEP_M / depth_m)
     noise = np.random.default_rng(0).integers(0, 256, (480, 640 + 64, 3), np.uint8)
@@ -55,7 +55,7 @@ def make_scene(frames: int) -> Scene:
     stretched: Image = ((wall.astype(np.float32) - low) * (255 / (high - low))).astype(np.uint8)
     scene: Scene = []
     for index in range(frames):
-        start = step_px * (index % 16)  # forth, and back in one jump
+        start = step_px * (index % 16)  # forward, and back in one jump
         left, right = (stretched[:, at : at + 640].copy() for at in (start, start + DISPARITY_PX))
         position_m = np.array([start * depth_m / RIG.fx, 0.0, 0.0])
         scene.append((left, right, Pose(np.eye(3), position_m)))
@@ -82,7 +82,7 @@ async def serving(threads: int) -> AsyncIterator[str]:
 
 @asynccontextmanager
 async def echoing(answer_bytes: int) -> AsyncIterator[str]:
-    """A gRPC server process that answers every message with ``answer_bytes`` bytes."""
+    """Start a gRPC server process that answers every message with ``answer_bytes`` bytes."""
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, __file__, "--echo", str(answer_bytes)),
         stdout=asyncio.subprocess.PIPE,
@@ -114,7 +114,7 @@ async def echo(answer_bytes: int) -> None:
 
 
 class BareModel:
-    """The recurrence by itself, as the server runs it."""
+    """Steps the model with its recurrent state, as the server does."""
 
     def __init__(self, threads: int) -> None:
         self._model = OnnxStereoModel(
@@ -145,7 +145,7 @@ async def measure(args: argparse.Namespace) -> dict[str, float]:
         client.open_session(RIG, delivery=Delivery.EVERY, encoding=encoding) as session,
     ):
         first = await session.step(left, right, pose)
-        # As the session asks for it by default of a server on its own machine.
+        # A session asks for this by default if the server is on its machine.
         answer = codec.disparity_to_proto(first, OutputFormat(compressed=False)).ByteSize()
         async with (
             echoing(answer) as echo_address,
@@ -153,7 +153,7 @@ async def measure(args: argparse.Namespace) -> dict[str, float]:
                 echo_address, options=[("grpc.max_receive_message_length", -1)]
             ) as channel,
         ):
-            connect: Any = channel.stream_stream  # without serialisers it speaks bytes
+            connect: Any = channel.stream_stream  # without serialisers, messages are bytes
             bare = connect(ECHO)()
             rounds: list[dict[str, float]] = []
             for index, (left, right, pose) in enumerate(scene):

@@ -1,21 +1,21 @@
-"""How old what a slow consumer sees is, over Zenoh: our receivers against the default one.
+"""Measure the age of what a slow consumer sees over Zenoh: our receivers and the default one.
 
     python tests/benchmarks/zenoh_age.py --json FILE
 
-A map is published at a camera's rate; each consumer works on what it takes for longer than a
-camera's period, as a headset does that cannot keep up. Ages are from capture to the moment a
-consumer has the map in its hands. All consumers of maps run side by side, each on a connection of
-its own to one publisher in another process.
+A map is published at a camera's rate. Each consumer works on a map for longer than a camera's
+period, as a headset does that cannot keep up. An age is the time from capture to the moment that a
+consumer takes the map. All consumers of maps run side by side, each on a connection of its own to
+one publisher in another process.
 
-- ``fifo``: Zenoh's default handler. Its age grows for as long as the consumer is slow.
-- ``ring``: Zenoh's ring channel of one.
-- ``inbox``: the receiver of this project with a room of one, with the event loop blocked by the
-  consumer's work.
-- ``session``: the whole way, from the camera through a real server with its model and back, by the
-  SDK; after the others, as it takes the machine for itself.
+- ``fifo``: Zenoh's default handler. The age grows for as long as the consumer is slow.
+- ``ring``: Zenoh's ring channel with room for one map.
+- ``inbox``: the receiver of this project with room for one map, while the consumer's work blocks
+  the event loop.
+- ``session``: the SDK, from the camera through a real server with its model and back. It runs after
+  the others, because it needs the whole machine.
 
-Of each: ``p50_ms p99_ms max_ms``, the median of the first and of the last second
-(``first_ms last_ms``), and how many were taken.
+Each row has ``p50_ms p99_ms max_ms``, the median of the first and of the last second
+(``first_ms last_ms``), and the number of maps that were taken.
 """
 
 import argparse

@@ -55,14 +55,16 @@ async def killed_server(
 
 
 async def test_a_killed_server_finishes_all_that_it_accepted(tmp_path: Path) -> None:
-    # Slow enough that the kill is in the middle of the batch, and of a sequence.
+    # Steps are so slow that the server is killed in the middle of a sequence.
     async with killed_server(tmp_path, step_s=0.04) as client:
         job_ids = [(await submit(client, archive))["id"] for archive in ARCHIVES]
         await ended(client, job_ids[2])
         before = {each["id"]: each["state"] for each in (await client.get("/v1/sequences")).json()}
     assert "queued" in before.values(), "the kill came too late to show anything"
     (tmp_path / "incoming" / "half").mkdir()
-    (tmp_path / "incoming" / "half" / "archive").write_bytes(b"PK")  # an upload it died in
+    (tmp_path / "incoming" / "half" / "archive").write_bytes(
+        b"PK"
+    )  # the server died during this upload
 
     async with killed_server(tmp_path) as client:
         jobs = [await ended(client, job_id) for job_id in job_ids]
@@ -91,7 +93,7 @@ async def test_a_sequence_goes_on_from_where_it_was_when_the_server_was_killed(
     tmp_path: Path,
 ) -> None:
     archive = zip_bytes(sequence_files(make_frames(60)))
-    # Twelve seconds of work, of which one is done: however busy the machine, the kill is in time.
+    # The job takes twelve seconds and is killed after one, which is in time on a busy machine too.
     async with killed_server(tmp_path, step_s=0.2) as client:
         job_id = (await submit(client, archive, metrics=True))["id"]
         await eventually(lambda: checkpoints_below(tmp_path))

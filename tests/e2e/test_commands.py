@@ -35,7 +35,7 @@ REPOSITORY = Path(__file__).parents[2]
 def vergence(
     *arguments: object, without: str = "", cwd: Path | None = None, **environment: str
 ) -> subprocess.CompletedProcess[str]:
-    """Run the command; ``without`` is a package that shall not be importable."""
+    """Run the command; ``without`` is a package that cannot be imported."""
     hidden = f"sys.modules[{without!r}] = None; " if without else ""
     start = "from vergence.cli.__main__ import main; sys.argv[0] = 'vergence'; main()"
     code = f"import sys; {hidden}{start}"
@@ -239,7 +239,7 @@ def test_a_damaged_frame_in_the_middle_is_named(server: str, tmp_path: Path) -> 
 def test_run_writes_the_maps_and_values_that_are_asked_for(
     wall: Path, server: str, tmp_path: Path
 ) -> None:
-    wall_m = FX * BASELINE_M / DISPARITY_PX  # errors put a part of the wall beyond it
+    wall_m = FX * BASELINE_M / DISPARITY_PX  # errors place a part of the wall further away
     outputs = (f"--output={each}" for each in ("disparity", "depth", "sigma", "confidence"))
     done = vergence(
         *("run", f"vergence:{wall}", "--server", server, "--out", tmp_path, "--frames", 2),
@@ -298,7 +298,7 @@ def test_doctor_finds_the_weights_and_a_running_server(server: str) -> None:
     assert f"{server} runs" in done.stdout
     found = "built; it serves lite" if vergence_native.available() else "onnxruntime serves"
     assert found in " ".join(done.stdout.split())
-    # The lines of the machine and of the server, which are one.
+    # The client and the server are on one machine, so both lines name its processor.
     assert done.stdout.count(instruction_set()) >= 2
 
 

@@ -26,7 +26,7 @@ PRINTS = {
 
 # The camera recipes, with the origin of their last frame: only the ZED tracks its own pose.
 RECIPES = {"oak.py": "pose lost", "realsense.py": "pose lost", "zed.py": "warm"}
-# Stand-ins of the cameras' SDKs, whose cameras film the bundled sample.
+# Modules that stand in for the cameras' SDKs. Their cameras film the bundled sample.
 CAMERA_SDKS = Path(__file__).parents[1] / "support" / "camera_sdks"
 
 

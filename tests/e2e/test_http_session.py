@@ -1,4 +1,4 @@
-"""The same session over http://: the same answers, the same errors, the same recovery."""
+"""A session over http:// has the same answers and errors, and recovers in the same way."""
 
 import asyncio
 

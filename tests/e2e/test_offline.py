@@ -1,4 +1,4 @@
-"""The law of the whole path: a stream over the network is the model stepped by hand."""
+"""The law of the whole path: a stream gives what the model gives if it is stepped by hand."""
 
 import asyncio
 

@@ -1,4 +1,4 @@
-"""The SDK and the server over Zenoh: the same answers as over gRPC, and the same rules."""
+"""Over Zenoh, the SDK and the server give the same answers as over gRPC, by the same rules."""
 
 import asyncio
 from contextlib import suppress
@@ -33,7 +33,7 @@ EXACT = OutputFormat(encoding=PlaneEncoding.FLOAT32, sigma=True, confidence=True
 
 
 def held(server: Running) -> list[str]:
-    """The streams of this server, of those called a and b."""
+    """Which of the streams a and b this server has."""
     found = []
     for stream_id in ("a", "b"):
         with suppress(UnknownStream):
@@ -102,7 +102,7 @@ async def test_every_frame_of_a_burst_is_accounted_for() -> None:
             await asyncio.to_thread(model.wait_until_entered)
             for frame_id in (2, 3, 4, 5, 6):
                 submit(session, frame_id)
-            # Displaced in the server, or dropped by Zenoh on a busy machine.
+            # The server displaced the frame, or Zenoh dropped it on a busy machine.
             await until_displaced(session, 3)
         first, second = [(await anext(session)).frame_id for _ in range(2)]
     assert (session.drops.at_source, session.drops.displaced, session.drops.total) == (1, 3, 4)

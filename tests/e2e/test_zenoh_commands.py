@@ -17,7 +17,7 @@ PATIENCE_S = 60.0
 
 @pytest.fixture(scope="module")
 def addresses() -> Iterator[list[str]]:
-    """Of one server, by gRPC and by Zenoh."""
+    """The addresses of one server, over gRPC and over Zenoh."""
     endpoint = free_endpoint()
     with subprocess.Popen(
         [

@@ -1,4 +1,4 @@
-"""Over a real Zenoh router: what dies, falls silent or loses messages, and what comes of it."""
+"""Over a real Zenoh router, processes die, fall silent and lose messages; sessions recover."""
 
 import asyncio
 import os
