@@ -130,7 +130,8 @@ class StereoRig:
             check_rotation(self.left_from_right.rotation)
         except BadPose as error:
             raise BadCalibration(f"left_from_right: {error}") from None
-        baseline_m = float(np.linalg.norm(self.left_from_right.translation_m))
+        with np.errstate(over="ignore"):
+            baseline_m = float(np.linalg.norm(self.left_from_right.translation_m))
         if not np.isfinite(baseline_m) or baseline_m <= 0:
             raise BadCalibration(
                 f"the baseline must be a positive length in metres, got {baseline_m}; "

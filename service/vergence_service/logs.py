@@ -5,10 +5,12 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 
 # Of messages from one place in the code, so many are written in each period.
 _MOST = 10
 _PERIOD_S = 60.0
+_MARK = "_vergence_logged"
 # The operating system has no more of something. A traceback says no more than the error's text.
 _SCARCE = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
 
@@ -39,6 +41,8 @@ class BoundedRate(logging.Filter):
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Decide whether the record is written, and shorten it."""
+        if _seen_before(record):
+            return False
         place = (record.pathname, record.lineno)
         now_s = self._clock()
         with self._lock:
@@ -56,6 +60,17 @@ class BoundedRate(logging.Filter):
         if count + 1 == _MOST:
             _append(record, f" (more like this are left out for {_PERIOD_S:.0f} s)")
         return True
+
+
+def _seen_before(record: logging.LogRecord) -> bool:
+    """Return True for an exception that is logged again: uvicorn repeats what the routes log."""
+    error = record.exc_info[1] if record.exc_info else None
+    if error is None:
+        return False
+    seen = getattr(error, _MARK, False)
+    with suppress(AttributeError):  # an exception without a dictionary
+        setattr(error, _MARK, True)
+    return bool(seen)
 
 
 def _shorten(record: logging.LogRecord) -> None:

@@ -55,6 +55,9 @@ class Metrics:
         self.streams_closed = Counter(
             "vergence_streams_closed", "Streams that were closed or have expired", registry=registry
         )
+        self.calls_open = Gauge(
+            "vergence_calls_open", "StreamDepth calls that have not ended", registry=registry
+        )
         self.streams_predicted = Gauge(
             "vergence_streams_predicted",
             "Live streams whose next frame is predicted",

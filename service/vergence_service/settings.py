@@ -72,6 +72,11 @@ class ZenohSettings(_Section):
     connect: tuple[str, ...] = Field(
         default=(), description="endpoints of routers and peers to connect to"
     )
+    shared_memory: bool = Field(
+        default=False,
+        description="take messages of this machine from shared memory: quicker, but Zenoh keeps "
+        "two descriptors of every client for ever",
+    )
     config: Path | None = Field(
         default=None,
         description="Zenoh JSON5 file for TLS and access control; replaces mode and endpoints",

@@ -2,13 +2,17 @@
 
 import io
 import json
+import lzma
 import struct
 import tarfile
+import tracemalloc
 import zipfile
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+
+import pytest
 
 from tests.support.http import ZIP, ended, http_server, reason_of, submit
 from tests.support.models import RecallModel
@@ -20,6 +24,9 @@ from tests.support.sequences import (
     with_size,
     zip_bytes,
 )
+from vergence_proto.errors import BadSequence, UploadTooLarge
+from vergence_service.jobs.archives import ArchiveLimits, unpacking
+from vergence_service.jobs.limited_reads import open_xz
 
 FILES = dict(sequence_files(make_frames(2)))
 HUGE_PNG = with_size(FILES["frame_0000_left.png"], 32_000, 32_000)
@@ -211,3 +218,93 @@ async def test_hostile_uploads_are_refused_and_leave_nothing_behind(tmp_path: Pa
             assert not [*(tmp_path / "incoming").iterdir(), *(tmp_path / "jobs").iterdir()], what
         fine = await submit(client, zip_bytes(FILES.items()))
         assert (await ended(client, fine["id"]))["state"] == "done"
+
+
+def packed_tar(*headers: bytes) -> bytes:
+    packer = zlib.compressobj(wbits=31)
+    return b"".join(map(packer.compress, headers)) + packer.compress(bytes(1024)) + packer.flush()
+
+
+def folders(count: int) -> bytes:
+    """A tar of so many folders, and nothing else."""
+    info = tarfile.TarInfo("folder")
+    info.type = tarfile.DIRTYPE
+    return packed_tar(info.tobuf() * count)
+
+
+def header_after_header(count: int) -> bytes:
+    """Each extended header says that another one follows."""
+    info = tarfile.TarInfo("pax")
+    info.type, info.size = tarfile.XHDTYPE, 512
+    return packed_tar(
+        (info.tobuf(tarfile.USTAR_FORMAT) + b"20 comment=01234567\n".ljust(512)) * count
+    )
+
+
+def large_headers(count: int) -> bytes:
+    info = tarfile.TarInfo("pax")
+    info.type, info.size = tarfile.XGLTYPE, 1 << 19
+    text = b"524288 comment=" + b"x" * ((1 << 19) - 16) + b"\n"
+    return packed_tar(*[info.tobuf(tarfile.USTAR_FORMAT) + text] * count)
+
+
+def directory_of(entries: int) -> bytes:
+    """A zip whose directory has so many entries for the same few bytes."""
+    one = zip_bytes([("a", b"")])
+    start = one.index(b"PK\x01\x02")
+    end = one.index(b"PK\x05\x06")
+    directory = one[start:end] * entries
+    tail = struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, 1, 1, len(directory), start, 0)
+    return one[:start] + directory + tail
+
+
+def xz_with_dictionary(nbytes: int) -> bytes:
+    filters = [{"id": lzma.FILTER_LZMA2, "preset": 0, "dict_size": nbytes}]
+    return lzma.compress(bytes(2048), format=lzma.FORMAT_XZ, filters=filters)
+
+
+@pytest.mark.parametrize(
+    ("packed", "error", "says"),
+    [
+        pytest.param(lambda: folders(5000), UploadTooLarge, "200 files", id="folders"),
+        pytest.param(lambda: header_after_header(2000), BadSequence, "complete", id="recursion"),
+        pytest.param(lambda: large_headers(3), BadSequence, "headers of at most", id="headers"),
+        pytest.param(
+            lambda: directory_of(60_000), BadSequence, "headers of at most", id="directory"
+        ),
+        pytest.param(lambda: xz_with_dictionary(1 << 29), BadSequence, "limit", id="dictionary"),
+    ],
+)
+def test_headers_of_an_archive_take_little_memory(
+    packed: Callable[[], bytes], error: type[Exception], says: str, tmp_path: Path
+) -> None:
+    archive, target = tmp_path / "archive", tmp_path / "target"
+    archive.write_bytes(packed())
+    target.mkdir()
+    limits = ArchiveLimits(max_files=200, max_unpacked_bytes=1 << 30, max_ratio=100)
+    tracemalloc.start()
+    try:
+        with pytest.raises(error, match=says):
+            list(unpacking(archive, target, limits))
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 8 << 20
+
+
+@pytest.mark.parametrize("preset", [0, 9])
+def test_an_xz_file_of_several_streams_is_read_back_and_forth(preset: int, tmp_path: Path) -> None:
+    content = bytes(range(256)) * 3000
+    half = len(content) // 2
+    path = tmp_path / "a.xz"
+    streams = [lzma.compress(part, preset=preset) for part in (content[:half], content[half:])]
+    path.write_bytes(streams[0] + bytes(4) + streams[1] + bytes(8))
+    with open_xz(path) as file:
+        assert file.read() == content
+        file.seek(1000)
+        assert file.read(50_000) == content[1000:51_000]
+        file.seek(half - 5)
+        assert file.read(10) == content[half - 5 : half + 5]
+    path.write_bytes(streams[0][:-20])
+    with open_xz(path) as file, pytest.raises(EOFError, match="cut short"):
+        file.read()

@@ -68,6 +68,14 @@ def test_a_shortage_is_one_line_without_a_traceback(lines: Lines, error: Excepti
     assert "ValueError: a bug" in lines.lines[1]
 
 
+def test_an_exception_is_logged_once(lines: Lines) -> None:
+    log = logging.getLogger("test.bounded")
+    error = ValueError("a bug")
+    log.error("a request failed", exc_info=error)
+    log.error("Exception in ASGI application", exc_info=error)
+    assert [line.splitlines()[0] for line in lines.lines] == ["a request failed"]
+
+
 @pytest.mark.parametrize(
     ("error", "known", "logged"),
     [

@@ -12,18 +12,26 @@ from vergence_proto.calibration.parts import Fields
 from vergence_proto.errors import BadCalibration
 from vergence_proto.text import decoded_text
 
+_LARGEST_BYTES = 1 << 20
 
-def read_fields(path: Path) -> Fields:
-    """Read the named values of a file.
+
+def read_fields(path: Path, *, opencv: bool = True) -> Fields:
+    """Read the named values of a file; ``opencv``: also those of OpenCV's FileStorage.
+
+    OpenCV's parser is not made for files of strangers: it allocates what a matrix says to have.
 
     Raises BadCalibration: there is no such file, or it holds none.
     """
     if not path.is_file():
         raise BadCalibration(f"{path}: not found; expected a calibration")
+    if (size := path.stat().st_size) > _LARGEST_BYTES:
+        raise BadCalibration(f"{path}: expected a calibration, got {size} bytes")
     text = decoded_text(path.read_bytes())
     if text is None:
         raise BadCalibration(f"{path}: expected text, a calibration")
     if re.match(r"%YAML:|<\?xml|<opencv_storage", text) or "opencv-matrix" in text:
+        if not opencv:
+            raise BadCalibration(f"{path}: expected YAML or JSON, got a file of OpenCV's")
         return Fields.of(path, _file_storage(path, text))
     try:
         # Of several documents, as a printed message has them, the first.
@@ -32,7 +40,7 @@ def read_fields(path: Path) -> Fields:
             if text.lstrip().startswith("{")
             else _first_document(text.expandtabs())
         )
-    except (yaml.YAMLError, json.JSONDecodeError) as error:
+    except (yaml.YAMLError, json.JSONDecodeError, RecursionError) as error:
         raise BadCalibration(f"{path}: neither YAML nor JSON: {error}".replace("\n", " ")) from None
     return Fields.of(path, read)
 

@@ -172,7 +172,8 @@ def _camera_from_proto(message: pb.Camera, side: str) -> Intrinsics:
 def _orientation_xyzw(message: pb.Pose) -> Matrix:
     q = message.orientation
     orientation_xyzw = _finite([q.x, q.y, q.z, q.w], "orientation")
-    length = float(np.linalg.norm(orientation_xyzw))
+    with np.errstate(over="ignore"):
+        length = float(np.linalg.norm(orientation_xyzw))
     if abs(length - 1) > _UNIT_TOLERANCE:
         raise BadPose(
             f"expected a unit quaternion x y z w, got {orientation_xyzw.tolist()} "

@@ -73,7 +73,10 @@ def _read_rig(path: Path, size: tuple[int, int]) -> tuple[StereoRig, bool]:
     if not path.exists():
         return nominal_rig(path, size), False
     try:
-        root = ElementTree.fromstring(existing(path, "Booster's calibration").read_bytes())
+        data = existing(path, "Booster's calibration").read_bytes()
+        if b"<!DOCTYPE" in data:  # it may define entities that expand without end
+            raise DatasetError(f"{path}: expected OpenCV's XML, got a document type")
+        root = ElementTree.fromstring(data)
     except ElementTree.ParseError as error:
         raise DatasetError(f"{path}: expected OpenCV's XML: {error}") from None
     left, right = (_matrix(path, root, name) for name in ("proj_matL", "proj_matR"))

@@ -44,7 +44,7 @@ def open_path(path: Path) -> StereoSource:
     mav = path / "mav0" if (path / "mav0").is_dir() else path
     files = tuple(mav / camera / "sensor.yaml" for camera in ("cam0", "cam1"))
     try:
-        left, right = (read_fields(file) for file in files)
+        left, right = (read_fields(file, opencv=False) for file in files)
         rig, body_from_left = calibration.read(left, right).rig, left.pose("T_BS")
     except BadCalibration as error:
         raise DatasetError(str(error)) from None

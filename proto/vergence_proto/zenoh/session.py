@@ -180,7 +180,7 @@ class ZenohSession:
             with query:
                 query.reply(key, message.SerializeToString(), encoding=encoding_of(message))
 
-        await self._in_thread(reply)
+        await self._to_the_end(reply)
 
     async def refuse(self, query: zenoh.Query, status: status_pb2.Status) -> None:
         """Reply to a query with an error, and drop it."""
@@ -189,7 +189,7 @@ class ZenohSession:
             with query:
                 query.reply_err(status.SerializeToString(), encoding=encoding_of(status))
 
-        await self._in_thread(refuse)
+        await self._to_the_end(refuse)
 
     async def declare_liveliness(self, key: str) -> Declaration:
         """Declare a liveliness token, which vanishes when this session or the link to it ends."""
@@ -218,6 +218,15 @@ class ZenohSession:
                     each.undeclare()
 
         await self._in_thread(undeclare)
+
+    async def _to_the_end(self, call: Callable[[], Value]) -> Value:
+        """Run a call that uses a query. If the caller is cancelled, it must not drop it before."""
+        running = asyncio.ensure_future(self._in_thread(call))
+        try:
+            return await asyncio.shield(running)
+        except asyncio.CancelledError:
+            await asyncio.wait([running])
+            raise
 
     async def _in_thread(self, call: Callable[[], Value]) -> Value:
         if self._closed:

@@ -51,6 +51,7 @@ async def serving_zenoh(
         mode=chosen.mode,
         listen=listen,
         connect=chosen.connect,
+        shared_memory=chosen.shared_memory,
         max_frame_bytes=calls.limits.max_frame_bytes,
     )
     endpoint = str(chosen.config or ",".join(listen or chosen.connect))

@@ -6,6 +6,7 @@ with a dot in front) is passed over.
 """
 
 import bz2
+import errno
 import gzip
 import lzma
 import os
@@ -17,14 +18,17 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from io import BufferedIOBase
 from pathlib import Path, PurePosixPath
-from typing import IO, cast
+from typing import IO, BinaryIO
 
 from vergence_proto.datasets.listing import is_data
 from vergence_proto.errors import BadSequence, InsufficientStorage, UploadTooLarge
+from vergence_service.jobs.limited_reads import limited_reads, open_xz
 from vergence_service.jobs.storage import free_bytes
 
-_CHUNK = 1 << 20
+_CHUNK = 1 << 16
 _LONGEST_NAME = 512
+_ENTRY_BYTES = 160  # of a usual name in the directory of a zip
+_LEAST_DIRECTORY = 1 << 20
 _NAME_BYTES = 512  # what an empty file costs: the header of a tar, about an entry of a file system
 _LONGEST_PART_BYTES = 255  # limit of common file systems
 # A colon or a backslash is a character like any other, but not on Windows.
@@ -33,7 +37,7 @@ _ZIP_START = b"PK"
 _DECOMPRESSORS: dict[bytes, Callable[[Path], BufferedIOBase]] = {
     b"\x1f\x8b": gzip.GzipFile,
     b"BZh": bz2.BZ2File,
-    b"\xfd7zXZ": lzma.LZMAFile,
+    b"\xfd7zXZ": open_xz,
 }
 # Errors of the standard library about archives that are damaged or malicious.
 _DAMAGED = (
@@ -46,6 +50,7 @@ _DAMAGED = (
     gzip.BadGzipFile,
     UnicodeError,
     ValueError,
+    RecursionError,  # a header of a tar that says that another one follows, and so on
 )
 
 
@@ -89,6 +94,10 @@ def unpacking(archive: Path, folder: Path, limits: ArchiveLimits) -> Iterator[No
                 yield from _writing(member, path, budget)
     except _DAMAGED as error:
         raise BadSequence(f"expected a complete zip or tar archive: {error}") from None
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # an offset before the beginning of the file
+            raise
+        raise BadSequence("expected a complete zip or tar archive: an offset is wrong") from None
 
 
 class _Budget:
@@ -96,8 +105,10 @@ class _Budget:
 
     def __init__(self, limits: ArchiveLimits, allowed_bytes: int, free_bytes: int) -> None:
         self._limits = limits
+        self.max_files = limits.max_files
         self._free_bytes = free_bytes
         self._files = 0
+        self._headers = 0
         self._bytes = 0
         self._allowed_bytes = allowed_bytes
 
@@ -118,6 +129,16 @@ class _Budget:
                 f"expected at most {self._limits.max_files} files in the archive; the server's "
                 "setting batch.max_files allows more"
             )
+
+    def take_header(self) -> None:
+        """Count a member of any kind, also a folder."""
+        self._headers += 1
+        self.check_files(self._headers // 2)  # as many folders as files
+
+    def limited(self, file: BinaryIO | BufferedIOBase, *, at_once: int) -> IO[bytes]:
+        """Return the archive for the standard library to read, within the limits."""
+        headers = max(_LEAST_DIRECTORY, self._limits.max_files * 2 * _NAME_BYTES)
+        return limited_reads(file, at_once=at_once, together=self._allowed_bytes + headers)
 
     def take_bytes(self, count: int) -> None:
         self._bytes += count
@@ -166,7 +187,12 @@ def _writing(member: _Member, path: Path, budget: _Budget) -> Iterator[None]:
 
 
 def _zip_members(archive: Path, start: bytes, budget: _Budget) -> Iterator[_Member]:
-    with zipfile.ZipFile(archive) as file:
+    # zipfile reads the whole directory at once, and makes an object of each entry.
+    directory = max(_LEAST_DIRECTORY, budget.max_files * _ENTRY_BYTES)
+    with (
+        archive.open("rb") as opened,
+        zipfile.ZipFile(budget.limited(opened, at_once=directory)) as file,
+    ):
         listed = list(_listed(file))
         budget.check_all(listed)
         yield from listed
@@ -200,9 +226,12 @@ def _tar_members(archive: Path, start: bytes, budget: _Budget) -> Iterator[_Memb
         ),
         None,
     ) or archive.open("rb")
-    small_reads = cast(IO[bytes], _SmallReads(opened))  # it has every method that tarfile needs
-    with opened, tarfile.open(fileobj=small_reads, mode="r:") as file:
-        for info in file:
+    # tarfile reads extended headers of any stated length.
+    with opened, tarfile.open(fileobj=budget.limited(opened, at_once=_CHUNK), mode="r:") as file:
+        while (info := file.next()) is not None:
+            # It remembers all members, with all that their headers say.
+            file.members.clear()  # type: ignore[attr-defined] # not in its stubs
+            budget.take_header()
             if info.isdir():
                 continue
             content = file.extractfile(info) if info.isreg() and not info.issparse() else None
@@ -215,21 +244,3 @@ def _tar_members(archive: Path, start: bytes, budget: _Budget) -> Iterator[_Memb
 
 def _same(content: IO[bytes]) -> Callable[[], IO[bytes]]:
     return lambda: content
-
-
-class _SmallReads:
-    """A file that refuses huge reads: tarfile reads extended headers of any stated length."""
-
-    def __init__(self, file: BufferedIOBase) -> None:
-        self._file = file
-
-    def read(self, size: int) -> bytes:
-        if size > _CHUNK:
-            raise BadSequence(f"a header of {size} bytes in a tar archive")
-        return self._file.read(size)
-
-    def seek(self, offset: int) -> int:
-        return self._file.seek(offset)
-
-    def tell(self) -> int:
-        return self._file.tell()

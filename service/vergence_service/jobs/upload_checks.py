@@ -82,7 +82,7 @@ def _check_arrays(path: Path, most_bytes: int) -> None:
             for info in members:
                 with archive.open(info) as member:
                     _check_array(member.read(_LARGEST_HEADER), info.file_size)
-    except _DAMAGED as error:
+    except (*_DAMAGED, OSError) as error:  # also of a wrong offset
         raise BadImage(f"expected a readable .npz file: {error}") from None
 
 

@@ -27,11 +27,12 @@ def break_between(
         return Origin.RESET_TIME_BACKWARDS
     if view.capture_ns - state.capture_ns > limits.max_gap_s * 1e9:
         return Origin.RESET_GAP
-    curr_from_prev = view.world_from_left.inverse() @ state.world_from_left
-    jump_m = float(np.linalg.norm(curr_from_prev.translation_m))
+    with np.errstate(over="ignore", invalid="ignore"):  # two cameras may be 1e300 m apart
+        curr_from_prev = view.world_from_left.inverse() @ state.world_from_left
+        jump_m = float(np.linalg.norm(curr_from_prev.translation_m))
     positions_known = view.position_known and state.position_known
     cosine = (float(np.trace(curr_from_prev.rotation)) - 1) / 2
     jump_deg = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-    if (positions_known and jump_m > limits.max_jump_m) or jump_deg > limits.max_jump_deg:
+    if (positions_known and not jump_m <= limits.max_jump_m) or jump_deg > limits.max_jump_deg:
         return Origin.RESET_POSE_JUMP
     return None

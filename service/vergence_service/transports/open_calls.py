@@ -53,11 +53,13 @@ class OpenCalls:
     async def run(self, call: DepthCall) -> None:
         """Serve the call to its end. Raises the DepthError that it ends with, or ClientLost."""
         self._running.add(call)
+        self._engine.metrics.calls_open.inc()
         self._idle.clear()
         try:
             await call.run()
         finally:
             self._running.discard(call)
+            self._engine.metrics.calls_open.dec()
             if not self._running:
                 self._idle.set()
 

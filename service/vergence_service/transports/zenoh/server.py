@@ -34,6 +34,7 @@ def zenoh_config(
     mode: str,
     listen: Sequence[str],
     connect: Sequence[str],
+    shared_memory: bool,
     max_frame_bytes: int,
 ) -> zenoh.Config:
     """Make the configuration, from a file or from mode and endpoints.
@@ -49,6 +50,7 @@ def zenoh_config(
             mode=mode,
             listen__endpoints=list(listen),
             connect__endpoints=list(connect),
+            transport__shared_memory__enabled=shared_memory,
         )
     except zenoh.ZError as error:
         raise ZenohUnreachable(reason_of(error)) from None
