@@ -43,6 +43,13 @@ class Hostile:
     says: str = ""
 
 
+def without_data(png: bytes) -> bytes:
+    """The picture with its data replaced by as many zeros; only a decoder sees that."""
+    start = png.index(b"IDAT") + 4
+    end = png.index(b"IEND") - 8
+    return png[:start] + bytes(end - start) + png[end:]
+
+
 def with_file(name: str, content: bytes = b"x") -> bytes:
     return zip_bytes([*FILES.items(), (name, content)])
 
@@ -167,6 +174,14 @@ HOSTILE = {
         ),
         "BAD_SEQUENCE",
         says="frame_0001_left.png: the PNG of 200 bytes is cut short",
+    ),
+    "pictures that are all damaged": Hostile(
+        lambda: zip_bytes(
+            (name, without_data(file) if name.endswith(".png") else file)
+            for name, file in FILES.items()
+        ),
+        "BAD_SEQUENCE",
+        says="frame_0000_left.png: the PNG",
     ),
     "a picture of a billion pixels": Hostile(
         lambda: zip_bytes({**FILES, "frame_0001_right.png": HUGE_PNG}.items()),

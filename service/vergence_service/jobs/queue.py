@@ -14,7 +14,7 @@ from vergence_service.jobs.progress import JobStatus
 from vergence_service.jobs.registry import JobRegistry
 from vergence_service.jobs.results import result_bytes
 from vergence_service.jobs.run import job_stream_config
-from vergence_service.jobs.sources import find_sequence
+from vergence_service.jobs.sources import check_readable, find_sequence
 from vergence_service.jobs.store import JobStore, folder_bytes, remove_folder
 from vergence_service.jobs.upload_checks import checking_folder
 from vergence_service.jobs.worker import JobWorker
@@ -122,6 +122,7 @@ class JobQueue:
         chosen, sequence = await self.threads.run(find_sequence, folder / "input", source)
         # Refuse now what could not be opened when the job runs.
         await self._engine.check_offline(job_stream_config(sequence, options))
+        await self.threads.run(check_readable, sequence, folder / "input")
         uploaded = await self.threads.run(folder_bytes, folder)
         result = result_bytes(sequence, options.outputs)
         job = Job(

@@ -15,6 +15,7 @@ from vergence_proto.datasets import (
 from vergence_proto.errors import BadSequence
 
 _NAMED_AT_MOST = 12
+_TRIED = 8  # frames
 
 
 def find_sequence(folder: Path, source: str | None) -> tuple[str, StereoSource]:
@@ -62,6 +63,20 @@ def _not_empty(source: str, sequence: StereoSource) -> tuple[str, StereoSource]:
     if len(sequence) == 0:
         raise BadSequence(f"{source}: no frames")
     return source, sequence
+
+
+def check_readable(sequence: StereoSource, folder: Path) -> None:
+    """Raise BadSequence if none of the first frames can be read: the job would have no result."""
+    first_error: DatasetError | None = None
+    for index in range(min(len(sequence), _TRIED)):
+        try:
+            sequence.without_truth()[index]
+        except DatasetError as error:
+            first_error = first_error or error
+        else:
+            return
+    if first_error is not None:
+        raise sequence_error(first_error, folder) from None
 
 
 def sequence_error(error: DatasetError, folder: Path) -> BadSequence:
