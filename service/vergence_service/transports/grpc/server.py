@@ -38,12 +38,12 @@ _CALLS_OF_A_CONNECTION = 64
 _MORE_CALLS = 64
 
 # A client that vanished is noticed within 15 s instead of gRPC's two hours. Clients may ping every
-# 5 s. A connection without calls is closed after 20 s.
+# 5 s. A connection without calls is closed after 10 to 20 s.
 _KEEPALIVE = (
     ("grpc.keepalive_time_ms", 10_000),
     ("grpc.keepalive_timeout_ms", 5_000),
     ("grpc.http2.ping_timeout_ms", 5_000),  # a minute by default, whatever keepalive_timeout_ms is
-    ("grpc.max_connection_idle_ms", 20_000),
+    ("grpc.max_connection_idle_ms", 10_000),
     ("grpc.keepalive_permit_without_calls", 1),
     ("grpc.http2.min_recv_ping_interval_without_data_ms", 4_000),
 )
