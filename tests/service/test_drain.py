@@ -267,6 +267,7 @@ def test_what_an_operator_can_mend_is_told_in_one_line(arguments: list[str], say
         with served("--http-port", "0", *words) as process:
             _, errors = process.communicate(timeout=30)
     assert process.returncode == 2
-    starting, trouble = errors.splitlines()
+    starting, *log, trouble = errors.splitlines()
     assert starting == "vergence serve: starting"
+    assert all(" INFO " in line for line in log)  # such as which engine computes
     assert says in trouble
