@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.support.http import ended, http_server, http_to, reason_of, submit
+from tests.support.http import ZIP, ended, http_server, http_to, reason_of, submit
 from tests.support.models import RecallModel
 from tests.support.polling import eventually
 from tests.support.sequences import (
@@ -128,12 +128,14 @@ async def test_a_frame_whose_pose_is_not_known_starts_cold() -> None:
     assert job["notes"] == ["poses.txt has no pose for 1 of 3 frames, which start cold"]
 
 
-async def test_a_sequence_of_which_nothing_can_be_read_fails() -> None:
+async def test_a_sequence_of_which_nothing_can_be_read_is_refused() -> None:
     files = {name: SMALL if name.endswith("left.png") else file for name, file in THREE.items()}
     async with http_server(RecallModel()) as client:
-        job = await ended(client, (await submit(client, zip_bytes(files.items())))["id"])
-    assert (job["state"], job["reason"]) == ("failed", "BAD_SEQUENCE")
-    assert job["message"].startswith("frame_0000_left.png: expected 64x48")
+        answer = await client.post("/v1/sequences", content=zip_bytes(files.items()), headers=ZIP)
+        jobs = (await client.get("/v1/sequences")).json()
+    assert reason_of(answer) == "BAD_SEQUENCE"
+    assert answer.json()["detail"].startswith("frame_0000_left.png: expected 64x48")
+    assert jobs == []
 
 
 PAIR = {"left": png(make_frames(1)[0].left), "right": png(make_frames(1)[0].right)}
