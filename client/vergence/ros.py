@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from vergence.depth_formats import webxr
 from vergence.results import DepthResult
 from vergence_proto.geometry import RectifiedRig
 
@@ -50,9 +51,7 @@ def depth_image(
     """
     pixels: np.ndarray[Any, Any] = result.depth_m
     if encoding == "16UC1":
-        millimetres = np.rint(result.depth_m.astype(np.float64) * 1000)
-        known = (millimetres > 0) & (millimetres <= np.iinfo(np.uint16).max)
-        pixels = np.where(known, millimetres, 0).astype(np.uint16)
+        pixels = webxr(result.depth_m, meters_per_unit=0.001)  # the same numbers
     return _image(pixels, encoding, _header(result, frame_id, stamp_ns))
 
 
