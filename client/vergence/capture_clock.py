@@ -10,8 +10,8 @@ from vergence_proto.errors import BadShape
 log: logging.Logger = logging.getLogger("vergence")
 
 _INT64 = range(-(2**63), 2**63)
-# A time of another clock is off by years, or by the time since the machine was started.
-_AGES_S = (-1.0, 3600.0)
+# Another clock is off by years, or by the time since the machine was started: minutes at least.
+_AGES_S = (-1.0, 120.0)
 # No stereo camera is faster: its times are microseconds, milliseconds or seconds.
 _LEAST_STEP_NS = 100_000
 

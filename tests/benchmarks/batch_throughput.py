@@ -39,8 +39,9 @@ from vergence_proto.datasets import SourceFrame, StereoSource, open_source
 from vergence_proto.geometry import RectifiedRig
 from vergence_proto.instruction_set import instruction_set
 from vergence_proto.types import StereoRig
+from vergence_service.inference.engines import load_model
 from vergence_service.inference.model import RecurrentState, Step, StereoView
-from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
+from vergence_service.inference.onnx_model import packaged_weights_dir
 
 LIVE_HZ = 15.0
 SEQUENCES = 2  # in the queue at once
@@ -53,8 +54,13 @@ class BareLoop:
         rectified = rig.as_rectified()
         assert rectified is not None, "the bare loop does not rectify"
         self._rig: RectifiedRig = rectified
-        self._model = OnnxStereoModel(
-            packaged_weights_dir(), "lite", providers=["cpu"], threads=threads, allow_spinning=False
+        self._model = load_model(
+            packaged_weights_dir(),
+            "lite",
+            engine="auto",  # the one that the server takes
+            providers=["cpu"],
+            threads=threads,
+            allow_spinning=False,
         )
         self._model.warm_up(1, self._iterations(None))
 

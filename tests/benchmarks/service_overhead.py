@@ -33,8 +33,9 @@ from vergence_proto import codec
 from vergence_proto.geometry import Pose, RectifiedRig
 from vergence_proto.instruction_set import instruction_set
 from vergence_proto.types import Image, OutputFormat, PoseSample, StereoFrame
+from vergence_service.inference.engines import load_model
 from vergence_service.inference.model import RecurrentState, Step, StereoView
-from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
+from vergence_service.inference.onnx_model import packaged_weights_dir
 
 RIG = RectifiedRig(640, 480, 500.0, 500.0, 319.5, 319.5, 239.5, 0.1)
 DISPARITY_PX = 12
@@ -117,8 +118,13 @@ class BareModel:
     """Steps the model with its recurrent state, as the server does."""
 
     def __init__(self, threads: int) -> None:
-        self._model = OnnxStereoModel(
-            packaged_weights_dir(), "lite", providers=["cpu"], threads=threads, allow_spinning=False
+        self._model = load_model(
+            packaged_weights_dir(),
+            "lite",
+            engine="auto",  # the one that the server takes
+            providers=["cpu"],
+            threads=threads,
+            allow_spinning=False,
         )
         self._iterations = self._model.card.iterations_at_most(1)
         self._state: RecurrentState | None = None

@@ -56,6 +56,7 @@ def test_an_untrained_network_already_matches() -> None:
     assert (error > 3).float().mean() < 0.1
 
 
+@pytest.mark.slow  # the exporter
 @pytest.mark.usefixtures("quick_export")
 def test_the_graph_equals_pytorch_frame_by_frame(network: LiteNetwork, tmp_path: Path) -> None:
     run = Run("lite", network.config, network.state_dict(), story={}, measured={})

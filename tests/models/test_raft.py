@@ -52,6 +52,7 @@ def test_the_images_reach_the_answer() -> None:
     assert (one - other).abs().mean() > 0.1
 
 
+@pytest.mark.slow  # the exporter
 @pytest.mark.usefixtures("quick_export")
 def test_exported_graphs_equal_pytorch_and_share_their_weights(tmp_path: Path) -> None:
     network = tiny_network()
@@ -76,6 +77,7 @@ def test_exported_graphs_equal_pytorch_and_share_their_weights(tmp_path: Path) -
         load_model_card(tmp_path, "full")
 
 
+@pytest.mark.slow  # the exporter
 @pytest.mark.usefixtures("quick_export")
 def test_the_exported_beginning_without_a_warp_equals_pytorch(tmp_path: Path) -> None:
     """Of `fast`. What follows it is the code of `full`, to the last operation."""

@@ -43,6 +43,8 @@ from vergence_models.studies.networks import (
 from vergence_models.studies.tables import Table, TableRow, markdown, read_tables, write_tables
 from vergence_models.training.runs import RunError, read_history, read_run
 
+pytestmark = pytest.mark.slow  # it steps every method over clips
+
 RUN = Path(__file__).parents[2] / "models" / "runs" / "lite"
 TINY = StudySettings(clips=1, frames=4, short=4, width=192, height=64)
 

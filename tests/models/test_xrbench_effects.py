@@ -15,6 +15,8 @@ from vergence_models.data.xrbench.recipe import Effects, Recipe
 from vergence_models.data.xrbench.things import Panel, Room, Surface, Thing, Workbench
 from vergence_models.data.xrbench.tracer import CameraView, Optics, TracedLight, Tracer
 
+pytestmark = pytest.mark.slow  # it renders with a path tracer
+
 STILL = Effects(exposure_s=0, readout_s=0, aperture_m=0, glare=0, flicker=0)
 OPTICS = Optics(64, 48, 60.0)
 

@@ -32,6 +32,8 @@ from vergence_models.data.xrbench.things import Room, Thing
 from vergence_models.data.xrbench.writer import render_sequence
 from vergence_proto.datasets import open_source
 
+pytestmark = pytest.mark.slow  # it renders with a path tracer
+
 TINY = Recipe("studio", frames=1, width=32, height=24, samples=4, fps=20, baseline_m=0.07)
 
 

@@ -15,6 +15,8 @@ from vergence_models.data.xrbench.camera import Eye, FrameTruth, StereoCamera
 from vergence_models.data.xrbench.recipe import Recipe
 from vergence_proto.geometry import Pose, RectifiedRig, uvd_curr_from_prev
 
+pytestmark = pytest.mark.slow  # it renders with a path tracer
+
 # Ten times the head's speed, so that frames differ by pixels in pictures this small.
 RECIPE = Recipe("playroom", speed=10, width=96, height=72, fov_deg=60)
 FRAMES = (0, 1, 2)
