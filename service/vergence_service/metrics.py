@@ -92,6 +92,16 @@ class Metrics:
             "Frames of sequences whose result was written",
             registry=registry,
         )
+        self.sequence_frames_failed = Counter(
+            "vergence_sequence_frames_failed",
+            "Frames of sequences that have no result, because they could not be read or stepped",
+            registry=registry,
+        )
+        self.sequences_refused = Counter(
+            "vergence_sequences_refused",
+            "Uploads that were refused because the disk has no room beside results",
+            registry=registry,
+        )
         self.sequence_s = Histogram(
             "vergence_sequence_seconds",
             "Time of one run of a sequence",

@@ -206,7 +206,7 @@ class BatchSettings(_Section):
         default=2.0, description="seconds of work that a crash may cost"
     )
     keep_h: PositiveFloat = Field(
-        default=24.0, description="hours that results are kept; less if disk_mib runs short"
+        default=24.0, description="hours that results are kept, fetched or not"
     )
     disk_mib: PositiveInt = Field(default=20_480, description="disk space of all jobs together")
     max_upload_mib: PositiveInt = Field(default=4096, description="largest upload")

@@ -71,7 +71,7 @@ async def test_one_failure_does_not_stop_the_others_and_is_reported(tmp_path: Pa
     paths = [tmp_path / name for name in ("dark", "broken.zip", "fine")]
     async with running_server(RecallModel()) as server:
         with pytest.raises(CliError, match="2 of 3 sequences failed"):
-            await run(paths, server.http_address, tmp_path / "out")
+            await run(paths, server.http_address, tmp_path / "out", on_error="fail")
     figures = json.loads((tmp_path / "out" / "batch.json").read_text())
     errors = {name: each["error"] for name, each in figures["results"].items()}
     assert errors["dark"].startswith("NON_FINITE")

@@ -115,7 +115,8 @@ async def run_to_the_middle(folder: Path, job: Job) -> None:
 
 
 def maps_in(folder: Path) -> list[NDArray[np.float32]]:
-    return [frame.offset_px for _, frame in read_frames(folder / "result")]
+    frames = read_frames(folder / "result")
+    return [frame.disparity.offset_px for frame in frames if frame.disparity is not None]
 
 
 async def test_a_sequence_continues_from_its_checkpoint_to_the_bit(tmp_path: Path) -> None:
@@ -149,7 +150,7 @@ def of_other_weights(folder: Path) -> None:
 
 
 def with_a_result_lost(folder: Path) -> None:
-    (folder / "result" / "000001.npz").write_bytes(b"")
+    (folder / "result" / "000001.frame").write_bytes(b"")
 
 
 @pytest.mark.parametrize("spoil", [truncated, of_other_weights, with_a_result_lost])

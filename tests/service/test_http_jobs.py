@@ -2,11 +2,13 @@
 
 import asyncio
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
+import pytest
 
 from tests.support.frames import frame_message, make_frame
 from tests.support.http import (
@@ -100,34 +102,30 @@ async def test_results_expire_by_age(tmp_path: Path) -> None:
         assert (await client.get("/v1/sequences")).json() == []
 
 
-async def test_the_oldest_results_make_room_and_what_waits_is_never_dropped(
-    tmp_path: Path,
+async def test_no_result_makes_room_for_another_before_it_expires(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    model = RecallModel()
-    archive = zip_bytes(sequence_files(make_frames(16)))  # of which five fit
+    archive = zip_bytes(sequence_files(make_frames(16)))
     flags: dict[str, Any] = {"batch__directory": tmp_path, "batch__disk_mib": 1}
-    async with http_server(model, **flags) as client:
-        job_ids = []
-        for _ in range(10):
-            job = await submit(client, archive)
-            await ended(client, job["id"])
-            job_ids.append(job["id"])
-        kept = [job["id"] for job in (await client.get("/v1/sequences")).json()]
-        assert kept == job_ids[-len(kept) :]
-        assert 0 < len(kept) < 10
-        assert sum(path.stat().st_size for path in (tmp_path / "jobs").rglob("*.npz")) < 1 << 20
-        with model.busy():
-            waiting = []
-            while True:
-                answer = await client.post("/v1/sequences", content=archive, headers=ZIP)
-                if answer.status_code != 202:
-                    break
-                waiting.append(answer.json()["id"])
-            assert (answer.status_code, reason_of(answer)) == (429, "QUEUE_FULL")
-            assert "disk" in answer.text
-        assert [(await ended(client, job_id))["state"] for job_id in waiting] == ["done"] * len(
-            waiting
-        )
+    query = {"output": ["disparity", "left"]}
+    async with http_server(RecallModel(), **flags) as client:
+        kept = []
+        while True:
+            answer = await client.post("/v1/sequences", params=query, content=archive, headers=ZIP)
+            if answer.status_code != 202:
+                break
+            kept.append(await ended(client, answer.json()["id"]))
+        assert len(kept) > 2
+        assert (answer.status_code, reason_of(answer)) == (429, "QUEUE_FULL")
+        assert "batch.disk_mib" in answer.text
+        assert int(answer.headers["Retry-After"]) >= 1
+        assert "refused" in caplog.text
+        assert "vergence_sequences_refused_total 1.0" in (await client.get("/metrics")).text
+        for job in kept:
+            assert len(await disparities(client, job["id"])) == 16
+            assert datetime.fromisoformat(job["expires"]) > datetime.now(UTC) + timedelta(hours=23)
+        await client.delete(f"/v1/sequences/{kept[0]['id']}")
+        await submit(client, archive)
         whale = zip_bytes(sequence_files(make_frames(120)))
         answer = await client.post("/v1/sequences", content=whale, headers=ZIP)
         assert (answer.status_code, reason_of(answer)) == (413, "UPLOAD_TOO_LARGE")

@@ -104,7 +104,7 @@ async def test_an_image_that_cannot_be_read_costs_its_own_frame(
         job = await ended(client, job["id"])
         answer = await client.get(f"/v1/sequences/{job['id']}/result", params={"format": "npz"})
     assert job["state"] == "done", job
-    assert job["frames_unread"] == len(unread)
+    assert job["frames_failed"] == len(unread)
     assert any(note in each for each in job["notes"]), job["notes"]
     with zipfile.ZipFile(io.BytesIO(answer.content)) as file:
         names = [name for name in file.namelist() if name.endswith(".npz")]

@@ -106,7 +106,7 @@ async def test_what_the_disk_has_no_room_for_is_refused_before_it_is_accepted(
             for body, what in (
                 (bytes(3 << 20), "the upload needs 3145728 bytes"),
                 (unpacked.getvalue(), "the archive needs 2097"),
-                (result, f"the result of the sequence needs {200 * 64 * 48 * 4} bytes"),
+                (result, f"the result of the sequence needs {200 * 64 * 48 * 5 // 4} bytes"),
             ):
                 answer = await http.post("/v1/sequences", content=body, headers=ZIP)
                 assert answer.status_code == httpx.codes.INSUFFICIENT_STORAGE, answer.text

@@ -66,6 +66,12 @@ def disparities_in(archive: bytes) -> list[NDArray[np.float32]]:
         return [np.load(io.BytesIO(file.read(name)))["disparity"] for name in names]
 
 
+def as_kept(disparity_px: Any) -> NDArray[np.float32]:
+    """Maps of a live stream as jobs keep them: rounded to 1/64 px, none below half of that."""
+    stored = np.rint(np.asarray(disparity_px, np.float32) * 64)
+    return np.asarray(np.where(stored == 0, np.nan, stored / 64), np.float32)
+
+
 def reason_of(answer: httpx.Response) -> str:
     """The reason of a refusal, which must be problem details."""
     assert answer.headers["Content-Type"] == "application/problem+json", answer.text

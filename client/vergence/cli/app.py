@@ -14,7 +14,7 @@ import typer
 from vergence.cli.errors import CliError
 from vergence.transports.addresses import DEFAULT_SERVER, connector
 from vergence_proto.errors import DepthError
-from vergence_proto.jobs import Output, ResultFormat
+from vergence_proto.jobs import MAP_FORMATS, JobOutput, OnError, Output, ResultFormat
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -185,8 +185,8 @@ def _run(
     from vergence.cli.run import run
     from vergence.cli.sources import CalibrationFlags
 
-    if form is ResultFormat.MP4:
-        raise CliError("--format mp4 is for vergence batch; run writes png16, pfm or npz")
+    if form not in MAP_FORMATS:
+        raise CliError(f"--format {form} is for vergence batch; run writes png16, pfm or npz")
     kept = KeptValues(min_confidence, min_depth, max_depth, speckle)
     _await(
         run(
@@ -220,8 +220,11 @@ def _batch(
         ResultFormat, typer.Option("--format", help="File format of results; mp4 is for viewing.")
     ] = ResultFormat.PNG16,
     output: Annotated[
-        list[Output], typer.Option(help="Map to write for every frame; may be repeated.")
-    ] = [Output.DISPARITY],  # noqa: B006  typer copies it
+        list[JobOutput], typer.Option(help="What to write for every frame; may be repeated.")
+    ] = [JobOutput.DISPARITY],  # noqa: B006  typer copies it
+    on_error: Annotated[
+        OnError, typer.Option(help="What a frame does that cannot be read or stepped.")
+    ] = OnError.SKIP,
     iterations: Annotated[
         int, typer.Option(min=0, help="Refinement iterations per frame; 0: the server's default.")
     ] = 0,
@@ -243,6 +246,7 @@ def _batch(
                 "output": [each.value for each in output],
                 "iterations": iterations,
                 "metrics": metrics,
+                "on_error": on_error.value,
             },
             json=json,
             console=_console(),

@@ -75,8 +75,8 @@ async def batch(
     failed = [outcome for outcome in outcomes if outcome.error]
     if failed:
         raise CliError(f"{len(failed)} of {len(outcomes)} sequences failed; the table says why")
-    if unread := sum(outcome.job.frames_unread for outcome in outcomes if outcome.job):
-        raise CliError(f"{unread} frames could not be read; the results of all others are written")
+    if unread := sum(outcome.job.frames_failed for outcome in outcomes if outcome.job):
+        raise CliError(f"{unread} frames have no map; the results of all others are written")
 
 
 async def _send(
@@ -152,7 +152,7 @@ def _figures(outcomes: Sequence[Outcome], seconds: float) -> Mapping[str, Any]:
                 "frames": each.job.frames if each.job else 0,
                 "fps": each.job.fps if each.job else None,
                 "accuracy": each.job.accuracy if each.job else None,
-                "frames_unread": each.job.frames_unread if each.job else 0,
+                "frames_failed": each.job.frames_failed if each.job else 0,
                 "error": each.error,
             }
             for each in outcomes

@@ -41,8 +41,8 @@ class Job:
     reason: str | None
     """The error code of a failed job."""
     message: str | None
-    frames_unread: int = 0
-    """The number of frames without a result, because an image could not be read."""
+    frames_failed: int = 0
+    """The number of frames without a map, because they could not be read or stepped."""
     notes: tuple[str, ...] = ()
     """What is missing in the upload or does not fit."""
 
@@ -59,7 +59,7 @@ class Job:
             accuracy=values["accuracy"],
             reason=values["reason"],
             message=values["message"],
-            frames_unread=values.get("frames_unread", 0),
+            frames_failed=values.get("frames_failed", 0),
             notes=tuple(values.get("notes", ())),
         )
 

@@ -5,16 +5,14 @@ A checkpoint is one file beside the results: a line of JSON, then the state as
 after the results of its frames have been written.
 """
 
-import dataclasses
 import json
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
-from vergence_proto.accuracy import Accuracy
 from vergence_service.inference.model import RecurrentState
 from vergence_service.inference.snapshots import state_from_bytes, state_to_bytes
+from vergence_service.jobs.tally import Tally
 
 _LONGEST_LINE = 64 << 20  # it lists the accuracy of every frame
 
@@ -26,10 +24,7 @@ class Checkpoint:
     frames: int
     state: RecurrentState  # state after these frames
     weights_sha256: str  # weights that the state belongs to
-    measured: tuple[Accuracy, ...]  # accuracy of the frames with ground truth
-    unread: Mapping[int, str] = field(
-        default_factory=dict
-    )  # why a file could not be read, by index
+    tally: Tally  # what these frames add up to
 
 
 def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
@@ -37,8 +32,7 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     about = {
         "frames": checkpoint.frames,
         "weights_sha256": checkpoint.weights_sha256,
-        "measured": [dataclasses.asdict(each) for each in checkpoint.measured],
-        "unread": list(checkpoint.unread.items()),
+        "tally": checkpoint.tally.to_values(),
     }
     unfinished = path.with_suffix(".new")
     unfinished.write_bytes(json.dumps(about).encode() + b"\n" + state_to_bytes(checkpoint.state))
@@ -63,8 +57,7 @@ def read_checkpoint(path: Path) -> Checkpoint | None:
             frames=about["frames"],
             state=state_from_bytes(state),
             weights_sha256=about["weights_sha256"],
-            measured=tuple(Accuracy(**each) for each in about["measured"]),
-            unread=dict(about.get("unread", [])),
+            tally=Tally.from_values(about["tally"]),
         )
     except (FileNotFoundError, KeyError, TypeError, ValueError):  # BadSnapshot is a ValueError
         return None

@@ -1,11 +1,12 @@
 """A job: one uploaded sequence, the options of its submission, and its state."""
 
+import dataclasses
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from vergence_proto.jobs import JobState, Output
+from vergence_proto.jobs import JobOutput, JobState, OnError, WarningKind
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -13,8 +14,17 @@ class JobOptions:
     """The options of a submission."""
 
     iterations: int = 0  # iterations of every step; 0: the server's defaults
-    outputs: tuple[Output, ...] = (Output.DISPARITY,)
+    outputs: tuple[JobOutput, ...] = (JobOutput.DISPARITY,)
     metrics: bool = False  # compare with the ground truth, if the upload has any
+    on_error: OnError = OnError.SKIP  # what a bad frame does
+
+
+@dataclass(frozen=True, slots=True)
+class JobWarning:
+    """What a user should know before the maps are there."""
+
+    kind: WarningKind
+    message: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,20 +37,28 @@ class Job:
     source_fps: float | None
     created_s: float  # Unix time, which stays valid after a restart
     client: str = ""  # address of the client that submitted it
+    name: str = ""  # the client's own name for it
+    labels: Mapping[str, str] = field(default_factory=dict)  # the client's own
     options: JobOptions = field(default_factory=JobOptions)
+    upload_sha256: str = ""  # of the body of the request, or of the upload
+    warnings: tuple[JobWarning, ...] = ()
+    cold_expected: int = 1  # frames that will start without a state, by their poses and times
+    megapixels: float = 0.3  # of a frame
     state: JobState = JobState.QUEUED
     attempts: int = 0  # runs that began at frame ``reached`` and were not finished
-    reached: int = 0  # frames that were done when the last run began
+    reached: int = 0  # frames that were done when the last run began, or when the job ended
+    started_s: float | None = None  # Unix time of its first run
     finished_s: float | None = None  # Unix time of its end
     finished_up_s: float | None = None  # the same, in seconds of the store's uptime
     fps: float | None = None
     disk_bytes: int = 0  # space reserved until the job ends, then space used
     result_bytes: int = 0  # the share of it that its result needs
     accuracy: Mapping[str, float] | None = None
-    frames_unread: int = 0  # frames without a result, because an image could not be read
+    frames_failed: int = 0  # frames without a map: an image could not be read, or the step failed
+    cold_frames: int = 0  # frames that started without a state
     notes: tuple[str, ...] = ()  # what is missing in the upload or does not fit
-    reason: str | None = None  # ErrorCode of the failure, or of what it waits for
-    message: str | None = None
+    reason: str | None = None  # code of the failure, or of what the job waits for
+    message: str | None = None  # the same in words
 
     @property
     def ended(self) -> bool:
@@ -49,14 +67,29 @@ class Job:
 
 def job_to_json(job: Job) -> str:
     document = {each.name: getattr(job, each.name) for each in fields(job)}
-    options = {each.name: getattr(job.options, each.name) for each in fields(job.options)}
-    return json.dumps({**document, "options": options})
+    document["options"] = dataclasses.asdict(job.options)
+    document["warnings"] = [[each.kind, each.message] for each in job.warnings]
+    return json.dumps(document)
 
 
 def job_from_json(document: str) -> Job:
     values: dict[str, Any] = json.loads(document)  # as job_to_json wrote it
-    options = values.pop("options")
-    outputs = tuple(map(Output, options.pop("outputs")))
-    state = JobState(values.pop("state"))
-    notes = tuple(values.pop("notes", ()))  # jobs of older servers have none
-    return Job(**values, notes=notes, state=state, options=JobOptions(**options, outputs=outputs))
+    known = {each.name for each in fields(Job)}
+    values = {name: value for name, value in values.items() if name in known}
+    options = {"on_error": OnError.SKIP, **values.pop("options")}
+    warnings = values.pop("warnings", [])  # jobs of older servers have none
+    return Job(
+        **{
+            **values,
+            "notes": tuple(values.get("notes", ())),
+            "state": JobState(values["state"]),
+            "warnings": tuple(JobWarning(WarningKind(kind), text) for kind, text in warnings),
+            "options": JobOptions(
+                **{
+                    **options,
+                    "outputs": tuple(map(JobOutput, options["outputs"])),
+                    "on_error": OnError(options["on_error"]),
+                }
+            ),
+        }
+    )

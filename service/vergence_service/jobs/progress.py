@@ -4,7 +4,19 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from vergence_service.jobs.forecast import COLD_WORK
 from vergence_service.jobs.job import Job
+
+
+def work_until(job: Job, frames: int) -> float:
+    """Return the work of the first ``frames`` of a job, in megapixels of warm steps.
+
+    The first frame is cold, and the other cold ones count as if they were spread evenly.
+    """
+    if not frames:
+        return 0.0
+    others = max(job.cold_expected - 1, 0) * (frames - 1) / max(job.frames - 1, 1)
+    return job.megapixels * (frames + (COLD_WORK - 1) * (1 + others))
 
 
 @dataclass(slots=True, eq=False)
@@ -29,9 +41,10 @@ class JobProgress:
     def fps(self) -> float:
         return (self.frames_done - self.frames_found) / max(self.elapsed_s, 1e-6)
 
-    def eta_s(self, frames: int) -> float | None:
-        """Return the time until all ``frames`` are done, or None before the first is done."""
-        return (frames - self.frames_done) / self.fps if self.fps else None
+    def work_per_s(self, job: Job) -> float | None:
+        """Return the work done in a second, or None before the first frame is done."""
+        done = work_until(job, self.frames_done) - work_until(job, self.frames_found)
+        return done / max(self.elapsed_s, 1e-6) if done else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,4 +55,5 @@ class JobStatus:
     frames_done: int
     ahead: int  # jobs that run before this one
     fps: float | None
-    eta_s: float | None  # time that its own remaining frames need
+    eta_s: float | None  # time until it is done, those before it included
+    expires_s: float | None  # Unix time until which its result is kept, at least

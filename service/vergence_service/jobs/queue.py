@@ -1,25 +1,30 @@
 """The admission of sequences: limits, checks of the upload, and the end of a job on request."""
 
+import logging
 import secrets
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
 
-from vergence_proto.errors import QueueFull, Quota
+from vergence_proto.errors import BadSequence, InsufficientStorage, QueueFull, Quota
+from vergence_proto.jobs import OnError
+from vergence_service.jobs.forecast import forecast
 from vergence_service.jobs.job import Job, JobOptions
 from vergence_service.jobs.progress import JobStatus
 from vergence_service.jobs.registry import JobRegistry
 from vergence_service.jobs.results import result_bytes
 from vergence_service.jobs.run import job_stream_config
-from vergence_service.jobs.sources import check_readable, find_sequence
+from vergence_service.jobs.sources import check_readable, find_sequence, missing_images
 from vergence_service.jobs.store import JobStore, folder_bytes, remove_folder
 from vergence_service.jobs.upload_checks import checking_folder
 from vergence_service.jobs.worker import JobWorker
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.threads import to_the_end
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,6 +36,16 @@ class QueueLimits:
     checkpoint_s: float  # seconds of work that a crash may cost
     keep_s: float  # time that ended jobs are kept
     disk_bytes: int  # disk space
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JobOrder:
+    """What a client asks for with its upload."""
+
+    source: str | None = None  # KIND:PATH; needed if the upload contains several sequences
+    options: JobOptions = field(default_factory=JobOptions)
+    name: str = ""
+    labels: Mapping[str, str] = field(default_factory=dict)
 
 
 class JobQueue:
@@ -105,24 +120,30 @@ class JobQueue:
             )
 
     async def accept(
-        self, folder: Path, source: str | None, options: JobOptions, *, client: str
+        self, folder: Path, order: JobOrder, *, upload_sha256: str, client: str
     ) -> JobStatus:
         """Accept the sequence below ``folder``/input. A crash does not lose an accepted job.
-
-        ``source`` is KIND:PATH; it is needed if the upload contains several sequences.
 
         Raises BadSequence, BadCalibration or FrameTooLarge if the upload cannot be stepped;
         UploadTooLarge, QueueFull or InsufficientStorage if it does not fit on the disk; QueueFull,
         and Quota if the client has too many unfinished jobs; and NotReady or Draining if the server
         accepts no work.
         """
-        await self.threads.finish(
-            checking_folder(folder / "input", max_pixels=self._engine.max_pixels)
-        )
-        chosen, sequence = await self.threads.run(find_sequence, folder / "input", source)
+        options, upload = order.options, folder / "input"
+        checking = checking_folder(upload, max_pixels=self._engine.max_pixels)
+        unreadable = [why async for why in self.threads.iterate(checking) if why is not None]
+        if unreadable and options.on_error is OnError.FAIL:
+            raise BadSequence(unreadable[0])
+        chosen, sequence = await self.threads.run(find_sequence, upload, order.source)
         # Refuse now what could not be opened when the job runs.
         await self._engine.check_offline(job_stream_config(sequence, options))
-        await self.threads.run(check_readable, sequence, folder / "input")
+        await self.threads.run(check_readable, sequence, upload)
+        unreadable += await self.threads.run(missing_images, sequence, upload)
+        if unreadable and options.on_error is OnError.FAIL:
+            raise BadSequence(unreadable[0])
+        found = await self.threads.run(
+            forecast, sequence, upload, self._engine.continuity, unreadable
+        )
         uploaded = await self.threads.run(folder_bytes, folder)
         result = result_bytes(sequence, options.outputs)
         job = Job(
@@ -132,18 +153,32 @@ class JobQueue:
             source_fps=sequence.fps,
             created_s=time.time(),
             client=client,
+            name=order.name,
+            labels=order.labels,
             options=options,
+            upload_sha256=upload_sha256,
+            warnings=found.warnings,
+            cold_expected=found.cold_frames,
+            megapixels=sequence.rig.left.width * sequence.rig.left.height / 1e6,
             disk_bytes=uploaded + result,
             result_bytes=result,
         )
         self._check_room(client)
         self._accepting.append(client)
         try:
-            await self.jobs.make_room(job)
+            await self._check_disk(job)
             await self.jobs.add(folder, job)
         finally:
             self._accepting.remove(client)
         return self.jobs.status(job.job_id)
+
+    async def _check_disk(self, job: Job) -> None:
+        try:
+            await self.jobs.check_room(job)
+        except (QueueFull, InsufficientStorage) as error:
+            self._engine.metrics.sequences_refused.inc()
+            log.warning("an upload of %s was refused: %s", job.client or "a client", error)
+            raise
 
     async def delete(self, job_id: str) -> None:
         """Stop a job if it has not ended, and delete all its files. Raises UnknownSequence."""

@@ -5,11 +5,10 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vergence_proto.errors import (
-    InsufficientStorage,
     QueueFull,
     SequenceNotDone,
     UnknownSequence,
@@ -17,7 +16,8 @@ from vergence_proto.errors import (
 )
 from vergence_proto.jobs import JobState
 from vergence_service.jobs.job import Job
-from vergence_service.jobs.progress import JobProgress, JobStatus
+from vergence_service.jobs.progress import JobProgress, JobStatus, work_until
+from vergence_service.jobs.results import has_frames
 from vergence_service.jobs.storage import check_free, disk_trouble, flushing
 from vergence_service.jobs.store import JobStore, folder_bytes
 from vergence_service.threads import ThreadPool, to_the_end
@@ -25,6 +25,15 @@ from vergence_service.threads import ThreadPool, to_the_end
 # The expected duration of a job before any has run. Clients are asked to retry after it.
 _USUAL_JOB_S = 2.0
 _PROGRESS_EVERY_S = 0.25
+_LONGEST_RETRY_S = 3600.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """The place of an unfinished job."""
+
+    ahead: int  # jobs before it
+    work: float  # of the waiting ones before it
 
 
 class JobRegistry:
@@ -47,6 +56,8 @@ class JobRegistry:
         self._changed = asyncio.Event()  # set at a change, and then replaced
         self._progress_due: asyncio.TimerHandle | None = None
         self._last_job_s = _USUAL_JOB_S
+        self._work_per_s: float | None = None  # of the last run
+        self._order: dict[str, _Place] | None = None  # of the unfinished jobs; None: has changed
 
     async def load(self) -> None:
         """Read the jobs of earlier servers."""
@@ -63,7 +74,7 @@ class JobRegistry:
         if job_id not in self._jobs:
             raise UnknownSequence(
                 f"no sequence {job_id[:64]!r}: it never existed, was deleted, or its result "
-                f"expired, {self._keep_s / 3600:g} h after its end or when disk space ran short"
+                f"expired, {self._keep_s / 3600:g} h after its end"
             )
         return self._jobs[job_id]
 
@@ -78,32 +89,66 @@ class JobRegistry:
     def status(self, job_id: str) -> JobStatus:
         """Return a job with its progress. Raises UnknownSequence."""
         job = self.get(job_id)
+        if job.ended:
+            done = job.frames if job.state is JobState.DONE else job.reached
+            return JobStatus(job, done, 0, job.fps, None, self.expires_s(job))
+        place = self._places()[job_id]
         progress = self._running.get(job_id)
-        if job.ended or progress is None:
-            done = job.frames if job.state is JobState.DONE else 0
-            ahead = 0 if job.ended else self.unfinished().index(job)
-            return JobStatus(job, done if job.ended else job.reached, ahead, job.fps, None)
-        return JobStatus(
-            job, progress.frames_done, 0, progress.fps or None, progress.eta_s(job.frames)
-        )
+        done = self._frames_done(job)
+        fps = job.fps if progress is None else progress.fps or None
+        return JobStatus(job, done, place.ahead, fps, self._eta_s(job, place), None)
+
+    def _places(self) -> "dict[str, _Place]":
+        if self._order is None:
+            self._order, work = {}, 0.0
+            for ahead, job in enumerate(self.unfinished()):
+                running = job.job_id in self._running
+                self._order[job.job_id] = _Place(0 if running else ahead, work)
+                if not running:
+                    work += work_until(job, job.frames) - work_until(job, job.reached)
+        return self._order
+
+    def _eta_s(self, job: Job, place: "_Place") -> float | None:
+        """Estimate the time until a job is done, from the speed of the last runs."""
+        rates = {
+            running: progress.work_per_s(self._jobs[running])
+            for running, progress in self._running.items()
+            if running in self._jobs
+        }
+        rate = rates.get(job.job_id) or next(filter(None, rates.values()), self._work_per_s)
+        if not rate:
+            return None
+        before = place.work
+        if job.job_id not in self._running:
+            for running in rates:
+                each = self._jobs[running]
+                before += work_until(each, each.frames) - work_until(each, self._frames_done(each))
+        own = work_until(job, job.frames) - work_until(job, self._frames_done(job))
+        return (before + own) / rate
+
+    def expires_s(self, job: Job) -> float | None:
+        """Return the Unix time until which the result of an ended job is kept, at least."""
+        return None if job.finished_s is None else job.finished_s + self._keep_s
 
     def statuses(self) -> list[JobStatus]:
         """Return all jobs with their progress, oldest first."""
         return [self.status(job_id) for job_id in self._jobs]
 
     def result(self, job_id: str) -> tuple[Job, Path]:
-        """Return a job that is done, and the folder of its result.
+        """Return a job that has ended with any result, and the folder of its result.
 
-        Raises UnknownSequence, and SequenceNotDone if the job waits, runs or has failed.
+        Raises UnknownSequence, and SequenceNotDone if the job waits or runs, or ended before its
+        first frame was done.
         """
         job = self.get(job_id)
-        if job.state is not JobState.DONE:
+        folder = self.folder(job_id) / "result"
+        if job.state is not JobState.DONE and not (job.ended and has_frames(folder)):
             failure = f": {job.reason}: {job.message}" if job.state is JobState.FAILED else ""
             raise SequenceNotDone(
                 f"sequence {job_id} has no result, it is {job.state}{failure}",
                 retry_after_s=None if job.ended else self.usual_job_s(),
             )
-        return job, self.folder(job_id) / "result"
+        return job, folder
 
     @contextmanager
     def reading(self, job_id: str) -> Iterator[None]:
@@ -124,11 +169,7 @@ class JobRegistry:
 
     def usual_job_s(self) -> float:
         """Estimate the time until the queue has a free place."""
-        etas_s = [
-            progress.eta_s(self._jobs[job_id].frames)
-            for job_id, progress in self._running.items()
-            if job_id in self._jobs
-        ]
+        etas_s = [self.status(job_id).eta_s for job_id in self._running if job_id in self._jobs]
         return max((eta_s for eta_s in etas_s if eta_s is not None), default=self._last_job_s)
 
     def folder(self, job_id: str) -> Path:
@@ -150,11 +191,15 @@ class JobRegistry:
     def begin_run(self, job_id: str) -> JobProgress:
         """Record that the worker runs a job; return the progress of the run, for it to update."""
         progress = self._running[job_id] = JobProgress(on_progress=self._notify_soon)
+        self._order = None
         return progress
 
     def end_stepping(self, job_id: str) -> None:
         """Record that the model is free again."""
-        self._last_job_s = self._running[job_id].elapsed_s
+        progress = self._running[job_id]
+        self._last_job_s = progress.elapsed_s
+        if job_id in self._jobs:
+            self._work_per_s = progress.work_per_s(self._jobs[job_id]) or self._work_per_s
 
     def end_run(self, job_id: str) -> None:
         """Record that the worker does nothing more for a job, or begins with it again."""
@@ -185,8 +230,8 @@ class JobRegistry:
         ``on_kept`` is called when the end is on the disk, before anybody sees it here.
         """
         used = 0
-        if job.state is JobState.DONE:
-            result = self._store.folder(job.job_id) / "result"
+        result = self._store.folder(job.job_id) / "result"
+        if await self._background.run(result.exists):
             await self._background.finish(flushing(result))
             used = await self._background.run(folder_bytes, result)
         job = replace(
@@ -194,6 +239,7 @@ class JobRegistry:
             finished_s=time.time(),
             finished_up_s=self._store.uptime_s(),
             disk_bytes=used,
+            result_bytes=used,
         )
         await self._background.run(self._store.update, job)
         on_kept()
@@ -207,6 +253,7 @@ class JobRegistry:
         """Make a job unknown to readers at once; :meth:`delete` follows. Raises UnknownSequence."""
         self.get(job_id)
         del self._jobs[job_id]
+        self._order = None
 
     async def delete(self, job_id: str) -> None:
         """Delete a job with its row and its files."""
@@ -228,7 +275,7 @@ class JobRegistry:
         await self._background.run(self._store.note_uptime)
         before_s = self._store.uptime_s() - self._keep_s
         for job in self._removable():
-            if _ended_up_s(job) < before_s:
+            if _ended_up_s(job) <= before_s:
                 await self.delete(job.job_id)
 
     def promised_bytes(self) -> int:
@@ -252,8 +299,8 @@ class JobRegistry:
             what=what,
         )
 
-    async def make_room(self, new: Job) -> None:
-        """Delete the oldest results until a new job fits.
+    async def check_room(self, new: Job) -> None:
+        """Refuse a job that does not fit beside all results that have not expired.
 
         Its upload is on the disk already. Raises UploadTooLarge if the job can never fit, QueueFull
         if it does not fit now, and InsufficientStorage if the disk has no room for its result.
@@ -265,26 +312,41 @@ class JobRegistry:
                 f"{self._disk_bytes} for all sequences; send it in parts, or start the server with "
                 "a larger batch.disk_mib"
             )
-        what = "the result of the sequence"
-        for job in sorted(self._removable(), key=_ended_up_s):
-            if self.used_bytes() + needed <= self._disk_bytes:
-                with suppress(InsufficientStorage):
-                    await self.check_free(new.result_bytes, what=what)
-                    return
-            await self.delete(job.job_id)
-        if self.used_bytes() + needed > self._disk_bytes:
+        await self.expire()
+        used = self.used_bytes()
+        if used + needed > self._disk_bytes:
             raise QueueFull(
-                f"the waiting sequences use {self.used_bytes()} of {self._disk_bytes} bytes on "
-                f"disk, this one needs {needed}; try again later (the server's setting "
-                "batch.disk_mib)",
-                retry_after_s=self.usual_job_s(),
+                f"sequences and their results use {used} of {self._disk_bytes} bytes on disk, this "
+                f"one needs {needed}, and no result is deleted before it expires; fetch and delete "
+                "results, or try again later (the server's settings batch.disk_mib, batch.keep_h)",
+                retry_after_s=self._room_in_s(),
             )
-        await self.check_free(new.result_bytes, what=what)
+        await self.check_free(new.result_bytes, what="the result of the sequence")
+
+    def _room_in_s(self) -> float:
+        """Estimate the time until a result expires, or a job ends that may fail."""
+        up_s = self._store.uptime_s()
+        waits_s = [
+            max(_ended_up_s(job) + self._keep_s - up_s, 0.0)
+            for job in self._jobs.values()
+            if job.ended
+        ]
+        return min([*waits_s, _LONGEST_RETRY_S], default=_LONGEST_RETRY_S)
+
+    def next_expiry_s(self, *, within_s: float) -> float:
+        """Return the time until the next result expires, but at most ``within_s``."""
+        up_s = self._store.uptime_s()
+        ends_s = (_ended_up_s(job) + self._keep_s - up_s for job in self._removable())
+        return min(max(min(ends_s, default=within_s), 0.0), within_s)
 
     def _removable(self) -> list[Job]:
         return [job for job in self._jobs.values() if job.ended and not self._readers[job.job_id]]
 
     def _notify_changed(self) -> None:
+        self._order = None
+        self._wake()
+
+    def _wake(self) -> None:
         self._changed.set()
         self._changed = asyncio.Event()
 
@@ -295,7 +357,7 @@ class JobRegistry:
 
     def _notify_progress(self) -> None:
         self._progress_due = None
-        self._notify_changed()
+        self._wake()
 
 
 def _ended_up_s(job: Job) -> float:

@@ -1,200 +1,157 @@
-"""The results of a job: one file per frame on disk, and the formats for download.
+"""The result of a job on disk.
 
 ::
 
-    result/rig.json         the rectified rig of the maps
-    result/000000.npz       offset_px float32 [H, W], NaN where there is no value; confidence uint8
-                            [H, W] and sigma_px float32 [H, W] if the job asked for them
+    result/run.json         what made it: versions, weights, the rectified rig, see ``Made``
+    result/000000.frame     one frame, see :mod:`vergence_proto.job_results.frame_file`
 
-A frame that could not be read has no file.
-
-Disparity here is the pixel offset u_left - u_right in the images, as in the files of
-``vergence run`` and of the data sets. Depth takes the principal points into account.
+A frame that could not be read or stepped has a file too, with the reason instead of a map.
 """
 
 import dataclasses
-import io
 import json
-import tempfile
-import zipfile
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
-
 from vergence_proto.datasets import StereoSource
-from vergence_proto.film import CannotFilm, FilmWriter
-from vergence_proto.geometry import RectifiedRig
-from vergence_proto.jobs import Output, ResultFormat
-from vergence_proto.result_files import encode_maps
-from vergence_proto.types import DisparityMap, Plane
+from vergence_proto.errors import BadImage, DepthError
+from vergence_proto.geometry import Pose, RectifiedRig
+from vergence_proto.job_results.frame_file import (
+    SUFFIX,
+    JobFrame,
+    decode_frame,
+    decode_record,
+    is_whole,
+)
+from vergence_proto.job_results.records import FrameRecord
+from vergence_proto.jobs import JobOutput
 
-_RIG = "rig.json"
-_CHUNK = 1 << 20
-# The colours cover the disparities of the first frame without the lowest and highest percent.
-_COLOUR_RANGE_PCT = (1, 99)
-
-
-class CannotEncode(RuntimeError):
-    """The format cannot be written on this machine."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FrameResult:
-    """The result of one frame."""
-
-    rig: RectifiedRig
-    offset_px: Plane
-    confidence: NDArray[np.uint8] | None
-    sigma_px: Plane | None
-
-    @property
-    def depth_m(self) -> Plane:
-        zero_px = np.float32(self.rig.offset_of_zero_disparity_px)
-        return self.rig.depth_from_disparity(self.offset_px - zero_px)
+_RUN = "run.json"
+_LONGEST_RECORD = 1 << 16
+# Bytes per pixel that planes of 1/64 px take at most in practice, compressed.
+_BYTES_A_PIXEL = {JobOutput.CONFIDENCE: 0.75, JobOutput.SIGMA: 1.5}
+_DISPARITY_BYTES_A_PIXEL = 1.25
 
 
-def start_result(folder: Path, rig: RectifiedRig) -> None:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Made:
+    """What made a result, and the cameras that its maps belong to."""
+
+    vergence: str  # version of the server
+    model: str
+    weights_sha256: str
+    engine: str  # what computed it
+    provider: str
+    rig: RectifiedRig | None  # None: no frame has a map
+    left_from_rectified: Pose | None  # the rectifying rotation
+
+    def to_json(self) -> str:
+        values = {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
+        if self.rig is not None:
+            values["rig"] = dataclasses.asdict(self.rig)
+        if self.left_from_rectified is not None:
+            values["left_from_rectified"] = self.left_from_rectified.matrix.tolist()
+        return json.dumps(values)
+
+    @classmethod
+    def from_json(cls, text: str) -> "Made":
+        values: dict[str, Any] = json.loads(text)
+        if values["rig"] is not None:
+            values["rig"] = RectifiedRig(**values["rig"])
+        if values["left_from_rectified"] is not None:
+            values["left_from_rectified"] = Pose.from_matrix(values["left_from_rectified"])
+        return cls(**values)
+
+
+def start_result(folder: Path, made: Made) -> None:
     """Begin a result, and delete the files of earlier attempts."""
     folder.mkdir(exist_ok=True)
     for old in folder.iterdir():
         old.unlink()
-    (folder / _RIG).write_text(json.dumps(dataclasses.asdict(rig)), "utf-8")
+    write_made(folder, made)
 
 
-def write_frame(folder: Path, index: int, disparity: DisparityMap) -> None:
-    """Write the file of one frame."""
-    arrays: dict[str, NDArray[Any]] = {"offset_px": disparity.offset_px}
-    if disparity.confidence is not None:
-        arrays["confidence"] = disparity.confidence
-    if disparity.sigma_px is not None:
-        arrays["sigma_px"] = disparity.sigma_px
-    np.savez(folder / f"{index:06d}.npz", allow_pickle=False, **arrays)
+def write_made(folder: Path, made: Made) -> None:
+    """Write what makes a result; the rig is known with the first map."""
+    (folder / _RUN).write_text(made.to_json(), "utf-8")
 
 
-def result_bytes(sequence: StereoSource, outputs: Collection[Output]) -> int:
-    """Return the disk space that the result of a sequence will need."""
+def read_made(folder: Path) -> Made:
+    """Read what made a result. Raises OSError: it has not begun."""
+    return Made.from_json((folder / _RUN).read_text("utf-8"))
+
+
+def write_frame(folder: Path, index: int, content: bytes) -> None:
+    """Write the file of one frame; a reader sees all of it or nothing."""
+    path = frame_path(folder, index)
+    unfinished = path.with_suffix(".new")
+    unfinished.write_bytes(content)
+    unfinished.replace(path)
+
+
+def has_frames(folder: Path) -> bool:
+    """Return whether any frame is done."""
+    return next(folder.glob(f"*{SUFFIX}"), None) is not None
+
+
+def frame_path(folder: Path, index: int) -> Path:
+    """Return the path of the file of one frame."""
+    return folder / f"{index:06d}{SUFFIX}"
+
+
+def result_bytes(sequence: StereoSource, outputs: Collection[JobOutput]) -> int:
+    """Estimate the disk space that the result of a sequence will need."""
     pixels = sequence.rig.left.width * sequence.rig.left.height
-    bytes_a_pixel = 4 + (Output.CONFIDENCE in outputs) + 4 * (Output.SIGMA in outputs)
-    return len(sequence) * pixels * bytes_a_pixel
+    bytes_a_pixel = _DISPARITY_BYTES_A_PIXEL + sum(_BYTES_A_PIXEL.get(each, 0) for each in outputs)
+    left = 0
+    if JobOutput.LEFT in outputs:
+        left = sum(each.left.stat().st_size for each in sequence.files if each.left.is_file())
+    return round(len(sequence) * pixels * bytes_a_pixel) + left
 
 
-def checking_frames(folder: Path, count: int, *, without: Collection[int] = ()) -> Iterator[bool]:
-    """Yield for each of the first ``count`` files, and for the rig, if it is complete.
+def checking_frames(folder: Path, count: int) -> Iterator[bool]:
+    """Yield for each of the first ``count`` files, and for what made them, if it is complete.
 
-    A crash may have cut off the last ones. Nothing follows the first that is not complete. Frames
-    of the indices ``without`` may have no file.
+    A crash may have cut off the last ones. Nothing follows the first that is not complete.
     """
     try:
-        RectifiedRig(**json.loads((folder / _RIG).read_text("utf-8")))
+        read_made(folder)
         yield True
         for index in range(count):
-            if index in without and not (folder / f"{index:06d}.npz").exists():
-                continue
-            with zipfile.ZipFile(folder / f"{index:06d}.npz") as file:
-                complete = file.testzip() is None
+            complete = is_whole(frame_path(folder, index).read_bytes())
             yield complete
             if not complete:
                 return
-    except (OSError, TypeError, ValueError, zipfile.BadZipFile):
+    except (OSError, TypeError, ValueError, KeyError, DepthError):
         yield False
 
 
-def count_frames(folder: Path) -> int:
-    """Return the number of frames that have a result."""
-    return sum(1 for _ in folder.glob("*.npz"))
+def read_records(folder: Path, start: int = 0) -> Iterator[FrameRecord]:
+    """Read the records of the frames from ``start`` on that are done, in order."""
+    for path in sorted(folder.glob(f"*{SUFFIX}")):
+        if int(path.stem) >= start:
+            with path.open("rb") as file:
+                yield decode_record(file.readline(_LONGEST_RECORD))
 
 
-def read_frames(folder: Path) -> Iterator[tuple[int, FrameResult]]:
-    """Read index and result of each frame that has one, in order."""
-    rig = RectifiedRig(**json.loads((folder / _RIG).read_text("utf-8")))
-    for path in sorted(folder.glob("*.npz")):
-        with np.load(path) as arrays:
-            yield (
-                int(path.stem),
-                FrameResult(
-                    rig, arrays["offset_px"], arrays.get("confidence"), arrays.get("sigma_px")
-                ),
-            )
+def read_frame(folder: Path, index: int, rig: RectifiedRig | None) -> JobFrame:
+    """Read one frame. Raises OSError: it is not there; BadImage: it is damaged."""
+    return decode_frame(frame_path(folder, index).read_bytes(), rig)
 
 
-def zip_of(folder: Path, form: ResultFormat, outputs: Collection[Output]) -> Iterator[bytes]:
-    """Make a zip with one file per frame and output, and yield it in pieces."""
-    sink = _Sink()
-    with zipfile.ZipFile(sink, "w") as archive:
-        archive.writestr(_RIG, (folder / _RIG).read_bytes())
-        for index, frame in read_frames(folder):
-            for file in encode_maps(_maps(frame, outputs), form):
-                folder_of = "" if file.output is None else f"{file.output}/"
-                archive.writestr(f"{folder_of}{index:04d}{file.suffix}", file.content)
-            yield sink.take()
-    yield sink.take()
+def read_frames(folder: Path) -> Iterator[JobFrame]:
+    """Read every frame that is done, in order, those without a map included.
 
-
-def mp4_of(folder: Path, *, fps: float) -> Iterator[bytes]:
-    """Make a film of disparity, and yield it in pieces, which are empty while frames are encoded.
-
-    Raises CannotEncode before the first piece.
+    Raises BadImage: a file is damaged.
     """
-    with tempfile.TemporaryDirectory() as scratch:
-        path = Path(scratch) / "disparity.mp4"
-        for _ in _writing_mp4(path, (frame.offset_px for _, frame in read_frames(folder)), fps):
-            yield b""
-        with path.open("rb") as file:
-            while chunk := file.read(_CHUNK):
-                yield chunk
-
-
-def _maps(frame: FrameResult, outputs: Collection[Output]) -> Mapping[Output, NDArray[Any]]:
-    planes: Mapping[Output, Callable[[], NDArray[Any] | None]] = {
-        Output.DISPARITY: lambda: frame.offset_px,
-        Output.DEPTH: lambda: frame.depth_m,
-        Output.CONFIDENCE: lambda: frame.confidence,
-        Output.SIGMA: lambda: frame.sigma_px,
-    }
-    maps = ((output, plane()) for output, plane in planes.items() if output in outputs)
-    return {output: map_ for output, map_ in maps if map_ is not None}
-
-
-def _writing_mp4(path: Path, frames: Iterator[Plane], fps: float) -> Iterator[None]:
-    low = high = 0.0
     try:
-        film = FilmWriter(path, fps=fps)
-    except CannotFilm as error:
-        raise CannotEncode(f"{error}; choose another format") from None
-    with film:
-        for index, offset_px in enumerate(frames):
-            known = np.isfinite(offset_px)
-            if index == 0 and known.any():
-                low, high = np.percentile(offset_px[known], _COLOUR_RANGE_PCT)
-            share = (np.nan_to_num(offset_px) - low) / max(high - low, 1e-6)
-            levels = (255 * np.clip(share, 0, 1)).astype(np.uint8)
-            colours = np.asarray(cv2.applyColorMap(levels, cv2.COLORMAP_TURBO), np.uint8)
-            colours[~known] = 0
-            film.add(colours[..., ::-1])  # BGR to RGB
-            yield
-
-
-class _Sink(io.RawIOBase):
-    """A file for zipfile that cannot seek. It is emptied between frames."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._pieces: list[bytes] = []
-
-    def writable(self) -> bool:
-        return True
-
-    def write(self, data: Any) -> int:  # anything with a buffer, as in the base class
-        piece = bytes(data)
-        self._pieces.append(piece)
-        return len(piece)
-
-    def take(self) -> bytes:
-        taken = b"".join(self._pieces)
-        self._pieces.clear()
-        return taken
+        rig = read_made(folder).rig
+    except FileNotFoundError:
+        return
+    for path in sorted(folder.glob(f"*{SUFFIX}")):
+        try:
+            yield decode_frame(path.read_bytes(), rig)
+        except BadImage as error:
+            raise BadImage(f"{path.name}: {error}") from None

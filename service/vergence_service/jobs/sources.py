@@ -79,6 +79,11 @@ def check_readable(sequence: StereoSource, folder: Path) -> None:
         raise sequence_error(first_error, folder) from None
 
 
+def missing_images(sequence: StereoSource, folder: Path) -> list[str]:
+    """Name the images that a sequence lists and that are not there."""
+    return [f"{relative_text(str(path), folder)}: not found" for path in sequence.missing_images]
+
+
 def sequence_error(error: DatasetError, folder: Path) -> BadSequence:
     """Return the error about a file below ``folder``, without the server's own path."""
     return BadSequence(relative_text(str(error), folder))

@@ -6,14 +6,18 @@ from dataclasses import dataclass
 from functools import partial
 
 from vergence_proto.datasets import DatasetError, SourceFrame, StereoSource, read_ahead
+from vergence_proto.errors import BadShape, DepthError, NonFinite
 from vergence_proto.ordered import in_order
 from vergence_proto.types import DisparityMap
 from vergence_service.inference.model import RecurrentState
 from vergence_service.streams.engine import DepthEngine
+from vergence_service.streams.rectify import Rectifier
 from vergence_service.streams.stream import Stream, StreamConfig
 
 # One frame is in the model while the map of the frame before is made.
 _IN_FLIGHT = 2
+# Errors of one frame: the next one can be stepped.
+FRAME_ERRORS = (BadShape, NonFinite)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,6 +28,23 @@ class Stepped:
     source: SourceFrame
     disparity: DisparityMap
     state: RecurrentState  # state after this frame
+    rectifier: Rectifier
+    note: DatasetError | None = None  # what is wrong with its ground truth
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Skipped:
+    """A frame without a result: it could not be read or stepped."""
+
+    index: int
+    error: DatasetError | DepthError
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Read:
+    index: int
+    source: SourceFrame
+    note: DatasetError | None
 
 
 async def step_all(
@@ -33,34 +54,66 @@ async def step_all(
     *,
     start: int = 0,
     state: RecurrentState | None = None,
-    on_unreadable: Callable[[int, DatasetError], None] | None = None,
-) -> AsyncGenerator[Stepped, None]:
+    may_skip: Callable[[DatasetError | DepthError], bool] = lambda _: False,
+) -> AsyncGenerator[Stepped | Skipped, None]:
     """Step the frames of ``sequence`` in order, each from the state after the frame before.
 
     Stepping begins at frame ``start``, from ``state``, the state after the frame before it. A frame
-    that cannot be read is left out, and ``on_unreadable`` gets its index and the error.
+    that cannot be read or stepped is skipped if ``may_skip`` allows it for the error.
 
-    Raises NotReady or Draining if the server accepts no work; BadCalibration, FrameTooLarge,
-    BadShape, ModelFailed or NonFinite if a frame cannot be stepped; and, without ``on_unreadable``,
-    DatasetError if a file cannot be read.
+    Raises NotReady or Draining if the server accepts no work; BadCalibration, FrameTooLarge or
+    ModelFailed if a frame cannot be stepped; and what ``may_skip`` does not allow: DatasetError if
+    a file cannot be read, BadShape or NonFinite if a frame cannot be stepped.
     """
     async with (
         engine.offline(config, state=state) as stream,
-        aclosing(
-            read_ahead(
-                sequence,
-                start=start,
-                in_thread=engine.threads.background.run,
-                on_unreadable=on_unreadable,
-            )
-        ) as frames,
-        aclosing(in_order(frames, partial(_step, engine, stream), limit=_IN_FLIGHT)) as steps,
+        aclosing(_reading(engine, sequence, start, may_skip)) as frames,
+        aclosing(in_order(frames, partial(_step, engine, stream, may_skip), limit=_IN_FLIGHT)) as (
+            steps
+        ),
     ):
         async for stepped in steps:
             yield stepped
 
 
-async def _step(engine: DepthEngine, stream: Stream, frame: tuple[int, SourceFrame]) -> Stepped:
-    index, source = frame
-    disparity, state = await engine.step_offline(stream, lambda: source.frame)
-    return Stepped(index, source, disparity, state)
+async def _reading(
+    engine: DepthEngine,
+    sequence: StereoSource,
+    start: int,
+    may_skip: Callable[[DatasetError | DepthError], bool],
+) -> AsyncGenerator[_Read | Skipped, None]:
+    errors: dict[int, DatasetError] = {}
+
+    def note(index: int, error: DatasetError) -> None:
+        if not may_skip(error):
+            raise error
+        errors[index] = error
+
+    reading = read_ahead(
+        sequence, start=start, in_thread=engine.threads.background.run, on_unreadable=note
+    )
+    async with aclosing(reading) as frames:
+        async for index, source in frames:
+            own = errors.pop(index, None)
+            for missing in sorted(errors):
+                yield Skipped(missing, errors.pop(missing))
+            yield _Read(index, source, own)
+    for missing in sorted(errors):
+        yield Skipped(missing, errors[missing])
+
+
+async def _step(
+    engine: DepthEngine,
+    stream: Stream,
+    may_skip: Callable[[DatasetError | DepthError], bool],
+    read: _Read | Skipped,
+) -> Stepped | Skipped:
+    if isinstance(read, Skipped):
+        return read
+    try:
+        disparity, state = await engine.step_offline(stream, lambda: read.source.frame)
+    except FRAME_ERRORS as error:
+        if not may_skip(error):
+            raise
+        return Skipped(read.index, error)
+    return Stepped(read.index, read.source, disparity, state, stream.rectifier, read.note)

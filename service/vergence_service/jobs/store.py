@@ -18,7 +18,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Self
 
-from vergence_proto.jobs import JobState
 from vergence_service.jobs.job import Job, job_from_json, job_to_json
 from vergence_service.jobs.storage import flush_path
 
@@ -166,8 +165,6 @@ class JobStore:
         remove_folder(self.folder(job.job_id) / "input")
         with suppress(OSError):
             (self.folder(job.job_id) / "checkpoint").unlink(missing_ok=True)
-        if job.state is JobState.FAILED:
-            remove_folder(self.folder(job.job_id) / "result")
 
     def _clear_leftovers(self) -> None:
         jobs = self.load()

@@ -27,20 +27,24 @@ _NPY_START = b"\x93NUMPY"
 _NPY_HEADERS = {(1, 0): read_array_header_1_0, (2, 0): read_array_header_2_0}
 
 
-def checking_folder(folder: Path, *, max_pixels: int) -> Iterator[None]:
-    """Check all files below ``folder``, and yield after each.
+def checking_folder(folder: Path, *, max_pixels: int) -> Iterator[str | None]:
+    """Check all files below ``folder``; yield after each what is wrong with it, or None.
 
-    Raises FrameTooLarge if a file or an image is too large, and BadSequence if it is damaged or of
-    an unknown kind.
+    A damaged image harms only its own frame. Raises FrameTooLarge if a file or an image is too
+    large, and BadSequence if another file is damaged or of an unknown kind.
     """
     for path in folder.rglob("*"):
+        damaged = None
         if path.is_file():
             try:
                 check_file(path, max_pixels=max_pixels)
             except (BadImage, FrameTooLarge) as error:
-                kind = FrameTooLarge if isinstance(error, FrameTooLarge) else BadSequence
-                raise kind(f"{path.relative_to(folder)}: {error}") from None
-        yield
+                damaged = f"{path.relative_to(folder)}: {error}"
+                if isinstance(error, FrameTooLarge):
+                    raise FrameTooLarge(damaged) from None
+                if path.suffix.lower() not in IMAGES:
+                    raise BadSequence(damaged) from None
+        yield damaged
 
 
 def check_file(path: Path, *, max_pixels: int) -> None:

@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import time
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 
@@ -19,8 +20,10 @@ from vergence_service.jobs.checkpoints import saved_frames
 from vergence_service.jobs.job import Job
 from vergence_service.jobs.progress import JobProgress
 from vergence_service.jobs.registry import JobRegistry
+from vergence_service.jobs.results import read_records
 from vergence_service.jobs.run import CHECKPOINT, run_job
 from vergence_service.jobs.storage import disk_trouble
+from vergence_service.jobs.tally import tally_of
 from vergence_service.streams.engine import DepthEngine
 
 log = logging.getLogger(__name__)
@@ -29,6 +32,7 @@ log = logging.getLogger(__name__)
 # the model failed. Then the job is failed: it probably causes that.
 _MAX_ATTEMPTS = 4
 _EXPIRE_EVERY_S = 30.0
+_LEAST_EXPIRE_S = 0.05
 # Pause before trying again when the disk refused to read or write.
 _TROUBLE_PAUSE_S = 1.0
 
@@ -152,6 +156,7 @@ class JobWorker:
             reached=saved,
             reason=None,
             message=None,
+            started_s=job.started_s or time.time(),
         )
         await self._jobs.update(started)
         # If the run before did not reach its first checkpoint, every frame of progress counts.
@@ -172,6 +177,12 @@ class JobWorker:
             if isinstance(known, NotReady):  # the server has no file descriptors left
                 raise
             if not isinstance(known, ModelFailed | StateMemory):
+                kept = await self._engine.threads.background.run(
+                    tally_of, read_records(folder / "result")
+                )
+                started = replace(
+                    started, reached=kept.frames, frames_failed=kept.failed, cold_frames=kept.cold
+                )
                 return _failed(started, known)
             # It may have been the moment, and not the frame.
             again = replace(_failed(started, known), state=JobState.QUEUED)
@@ -183,7 +194,8 @@ class JobWorker:
             state=JobState.DONE,
             fps=progress.fps or None,
             accuracy=accuracy,
-            frames_unread=found.frames_unread,
+            frames_failed=found.frames_failed,
+            cold_frames=found.cold_frames,
             notes=found.notes,
         )
 
@@ -197,7 +209,9 @@ class JobWorker:
     async def _expire_regularly(self) -> None:
         while True:
             await self._jobs.expire()
-            await asyncio.sleep(_EXPIRE_EVERY_S)
+            await asyncio.sleep(
+                max(self._jobs.next_expiry_s(within_s=_EXPIRE_EVERY_S), _LEAST_EXPIRE_S)
+            )
 
 
 def _given_up(job: Job) -> Job:

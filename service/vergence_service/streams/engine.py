@@ -92,6 +92,21 @@ class DepthEngine:
         """True while new streams are accepted."""
         return self._phase is _Phase.SERVING
 
+    @property
+    def computed_by(self) -> str:
+        """The inference engine and its instruction set."""
+        return self._model.engine
+
+    @property
+    def provider(self) -> str:
+        """The execution provider of the model."""
+        return self._model.provider
+
+    @property
+    def continuity(self) -> ContinuityLimits:
+        """The limits beyond which a frame starts without a state."""
+        return self._limits
+
     async def start(self) -> None:
         """Load what live streams need, and accept streams.
 

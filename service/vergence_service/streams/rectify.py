@@ -97,6 +97,11 @@ class Rectifier:
                 left, right = left_maps.remap(left), right_maps.remap(right)
             return self.window.images(left, right)
 
+    def rectified_left(self, left: Image) -> Image:
+        """The left image at the size of ``rig``, from the image as the camera took it."""
+        with _opencv_errors():
+            return left if self.maps is None else self.maps[0].remap(left)
+
     def disparity_px(self, offset_px: Plane) -> Plane:
         """Disparity [H, W] of ``rig`` from the model's offset.
 

@@ -3,23 +3,27 @@
 import asyncio
 from collections.abc import AsyncGenerator, AsyncIterator, Iterator
 from contextlib import aclosing
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
-from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
-from vergence_proto.errors import BadShape, ErrorCode, NotReady, UnknownSequence
-from vergence_proto.jobs import JobState, Output, ResultFormat
-from vergence_service.jobs.job import Job, JobOptions
+from vergence_proto.errors import (
+    BadShape,
+    NotReady,
+    SequenceNotDone,
+    UnknownSequence,
+)
+from vergence_proto.jobs import JobOutput, JobState, ResultFormat
+from vergence_service.jobs.archive import CannotEncode, mp4_of, zip_of
+from vergence_service.jobs.job import JobOptions
 from vergence_service.jobs.progress import JobStatus
-from vergence_service.jobs.queue import JobQueue
+from vergence_service.jobs.queue import JobOrder, JobQueue
 from vergence_service.jobs.registry import JobRegistry
-from vergence_service.jobs.results import CannotEncode, mp4_of, zip_of
 from vergence_service.threads import ThreadPool
 from vergence_service.transports.http.errors import PROBLEM_RESPONSE
+from vergence_service.transports.http.sequence_models import ResultQuery, SequenceJob, SubmitQuery
 from vergence_service.transports.http.uploads import (
     ARCHIVE_TYPES,
     FORM_TYPE,
@@ -29,111 +33,8 @@ from vergence_service.transports.http.uploads import (
     while_connected,
 )
 
-_FILM_FPS = 30.0  # frame rate of a film whose sequence does not state one
 # Proxies close connections that are silent for longer than about this.
 _SILENCE_S = 15.0
-
-_EXAMPLE: dict[str, JsonValue] = {
-    "id": "5f0c9a7be21d4433",
-    "state": "running",
-    "created": "2026-01-31T12:00:00Z",
-    "source": "vergence:room",
-    "frames": 300,
-    "frames_done": 120,
-    "ahead": 0,
-    "fps": 31.5,
-    "eta_s": 5.7,
-    "output": ["disparity"],
-    "iterations": 0,
-    "metrics": False,
-    "accuracy": None,
-    "frames_unread": 0,
-    "notes": [],
-    "reason": None,
-    "message": None,
-}
-
-
-class SubmitQuery(BaseModel):
-    """The options of a submission."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    source: str | None = Field(
-        default=None,
-        description="the sequence as KIND:PATH in the archive, for example vergence:room or "
-        "kitti:sequences/00; needed if the archive contains several",
-    )
-    model: str | None = Field(default=None, description="refuse unless the server runs this model")
-    iterations: int = Field(
-        default=0, ge=0, le=64, description="iterations of every step; 0: the default"
-    )
-    output: list[Output] = Field(
-        default=[Output.DISPARITY], description="maps to keep for every frame"
-    )
-    metrics: bool = Field(default=False, description="compare with the ground truth in the archive")
-    wait: bool = Field(default=False, description="answer with the result, when the job is done")
-    format: ResultFormat = Field(
-        default=ResultFormat.PNG16, description="format of the awaited result"
-    )
-
-
-class ResultQuery(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
-    format: ResultFormat = ResultFormat.PNG16
-
-
-class SequenceJob(BaseModel):
-    """A sequence that was accepted."""
-
-    model_config = ConfigDict(json_schema_extra={"example": _EXAMPLE})
-
-    id: str
-    state: JobState
-    created: datetime
-    source: str = Field(description="the sequence as KIND:PATH in the upload")
-    frames: int
-    frames_done: int
-    ahead: int = Field(description="sequences that run before this one")
-    fps: float | None
-    eta_s: float | None = Field(description="seconds that its remaining frames need")
-    output: list[Output]
-    iterations: int
-    metrics: bool
-    accuracy: dict[str, float] | None = Field(description="mean over the frames with ground truth")
-    frames_unread: int = Field(
-        description="frames without a result, because an image is missing or damaged"
-    )
-    notes: list[str] = Field(description="what is missing in the upload or does not fit")
-    reason: ErrorCode | None = Field(
-        description="code of the failure, or of what the sequence waits for"
-    )
-    message: str | None
-
-    @classmethod
-    def of(cls, status: JobStatus) -> "SequenceJob":
-        job = status.job
-        return cls(
-            id=job.job_id,
-            state=job.state,
-            created=datetime.fromtimestamp(job.created_s, UTC),
-            source=job.source,
-            frames=job.frames,
-            frames_done=status.frames_done,
-            ahead=status.ahead,
-            fps=status.fps,
-            eta_s=status.eta_s,
-            output=list(job.options.outputs),
-            iterations=job.options.iterations,
-            metrics=job.options.metrics,
-            accuracy=None if job.accuracy is None else dict(job.accuracy),
-            frames_unread=job.frames_unread,
-            notes=list(job.notes),
-            reason=None if job.reason is None else ErrorCode(job.reason),
-            message=job.message,
-        )
-
 
 _FILE = {"type": "string", "format": "binary"}
 _BINARY = {"schema": _FILE}
@@ -192,21 +93,31 @@ def sequence_routes(
         """
         if query.model not in (None, model):
             raise BadShape(f"expected {model}, the model of this server, got {query.model!r}")
-        options = JobOptions(
-            iterations=query.iterations,
-            outputs=tuple(dict.fromkeys(query.output)),
-            metrics=query.metrics,
+        order = JobOrder(
+            source=query.source,
+            options=JobOptions(
+                iterations=query.iterations,
+                outputs=_kept(query.output),
+                metrics=query.metrics,
+                on_error=query.on_error,
+            ),
+            name=query.name,
         )
         client = client_of(request)
         upload_bytes = int(request.headers.get("content-length", 0))
         async with queue.upload_folder(client, upload_bytes=upload_bytes) as folder:
-            await receive_sequence(request, folder, limits, threads)
+            digest = await receive_sequence(request, folder, limits, threads)
             async with while_connected(request):
-                status = await queue.accept(folder, query.source, options, client=client)
+                status = await queue.accept(folder, order, upload_sha256=digest, client=client)
         job_id = status.job.job_id
         if query.wait:
             while not (status := jobs.status(job_id)).job.ended and not stopping.is_set():
                 await _change(jobs, stopping)
+            if status.job.state is JobState.FAILED:
+                raise SequenceNotDone(
+                    f"sequence {job_id} has failed: {status.job.reason}: {status.job.message}; "
+                    "its result keeps the frames before"
+                )
             if status.job.ended:
                 return await _result(jobs, job_id, query.format, threads)
         return JSONResponse(
@@ -304,11 +215,17 @@ async def _change(jobs: JobRegistry, stopping: asyncio.Event) -> None:
             wait.cancel()
 
 
+def _kept(outputs: list[JobOutput]) -> tuple[JobOutput, ...]:
+    """Return what a job keeps: points need the colours of the left image."""
+    points = [JobOutput.LEFT] if JobOutput.POINTS in outputs else []
+    return tuple(dict.fromkeys([*outputs, *points]))
+
+
 async def _result(
     jobs: JobRegistry, job_id: str, form: ResultFormat, threads: ThreadPool
 ) -> Response:
     job, folder = jobs.result(job_id)
-    pieces = _pieces(jobs, job, folder, form, threads)
+    pieces = _pieces(jobs, jobs.status(job_id), folder, form, threads)
     try:
         # An error of the encoder must come before the answer begins.
         while not (first := await anext(pieces)):
@@ -332,14 +249,14 @@ async def _chained(first: bytes, rest: AsyncGenerator[bytes, None]) -> AsyncIter
 
 
 async def _pieces(
-    jobs: JobRegistry, job: Job, folder: Path, form: ResultFormat, threads: ThreadPool
+    jobs: JobRegistry, status: JobStatus, folder: Path, form: ResultFormat, threads: ThreadPool
 ) -> AsyncGenerator[bytes, None]:
     pieces: Iterator[bytes]
     if form is ResultFormat.MP4:
-        pieces = mp4_of(folder, fps=job.source_fps or _FILM_FPS)
+        pieces = mp4_of(status.job, folder)
     else:
-        pieces = zip_of(folder, form, job.options.outputs)
+        pieces = await threads.run(zip_of, status, folder, form)
     async with aclosing(threads.iterate(pieces)) as taken:
-        with jobs.reading(job.job_id):
+        with jobs.reading(status.job.job_id):
             async for piece in taken:
                 yield piece

@@ -5,12 +5,13 @@ leaves files only in the folder that the caller provides and removes.
 """
 
 import asyncio
+import hashlib
 import json
 from collections.abc import AsyncIterator, Iterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, BinaryIO
 
 from fastapi import Request
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
@@ -135,32 +136,46 @@ async def while_connected(request: Request) -> AsyncIterator[None]:
 
 async def receive_sequence(
     request: Request, folder: Path, limits: UploadLimits, threads: ThreadPool
-) -> None:
+) -> str:
     """Write the sequence in the body of a request to ``folder``/input, in ``threads``.
+
+    Returns the SHA-256 of the body.
 
     Raises BadSequence if the body is not an allowed form or archive or is cut off, and
     UploadTooLarge if it exceeds a limit.
     """
     kind = media_type(request)
+    digest = hashlib.sha256()
     if kind == FORM_TYPE:
-        parts = await receive_form(request, folder, limits, threads)
+        parts = await receive_form(request, folder, limits, threads, digest=digest)
         async with while_connected(request):
             await threads.finish(_arranging(parts, folder, limits))
     elif kind in ARCHIVE_TYPES:
         archive = folder / "archive"
         with archive.open("wb") as file:
             async for chunk in _chunks(request, limits):
-                await threads.run(file.write, chunk)
+                await threads.run(_write, file, chunk, digest)
         async with while_connected(request):
             await threads.finish(_unpacking(archive, folder, limits))
     else:
         raise BadSequence(
             f"expected a body of {FORM_TYPE} or {', '.join(ARCHIVE_TYPES)}, got {kind!r}"
         )
+    return digest.hexdigest()
+
+
+def _write(file: BinaryIO, chunk: bytes, digest: "hashlib._Hash") -> None:
+    file.write(chunk)
+    digest.update(chunk)
 
 
 async def receive_form(
-    request: Request, folder: Path, limits: UploadLimits, threads: ThreadPool
+    request: Request,
+    folder: Path,
+    limits: UploadLimits,
+    threads: ThreadPool,
+    *,
+    digest: "hashlib._Hash | None" = None,
 ) -> list[FormPart]:
     """Write every part of a form to a file in ``folder``.
 
@@ -172,6 +187,8 @@ async def receive_form(
     try:
         async for chunk in _chunks(request, limits):
             await threads.run(writer.write, chunk)
+            if digest is not None:
+                await threads.run(digest.update, chunk)
         return writer.finish()
     finally:
         writer.close()

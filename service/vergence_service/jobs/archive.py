@@ -1,0 +1,168 @@
+"""Results for download: the manifest of a job, an archive in any layout, or a film."""
+
+import dataclasses
+import io
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from vergence_proto.film import CannotFilm, FilmWriter
+from vergence_proto.job_results.frame_file import STEPS_PER_PX
+from vergence_proto.job_results.layouts import LAYOUTS
+from vergence_proto.job_results.manifest import VERSION, about_of
+from vergence_proto.jobs import ResultFormat
+from vergence_proto.types import Plane
+from vergence_service.jobs.job import Job
+from vergence_service.jobs.progress import JobStatus
+from vergence_service.jobs.results import read_frames, read_made
+
+_CHUNK = 1 << 20
+_FILM_FPS = 30.0  # frame rate of a film whose sequence does not state one
+# The colours cover the disparities of the first frame without the lowest and highest percent.
+_COLOUR_RANGE_PCT = (1, 99)
+
+
+class CannotEncode(RuntimeError):
+    """The format cannot be written on this machine."""
+
+
+def manifest_of(status: JobStatus, folder: Path) -> dict[str, Any]:
+    """Return what is known about a job, for ``manifest.json``.
+
+    Raises FileNotFoundError: no frame is done.
+    """
+    job, made = status.job, read_made(folder)
+    rig, rotation = made.rig, made.left_from_rectified
+    return {
+        "manifest": VERSION,
+        "id": job.job_id,
+        "name": job.name,
+        "labels": dict(job.labels),
+        "state": job.state.value,
+        "reason": job.reason,
+        "message": job.message,
+        "vergence": made.vergence,
+        "model": {
+            "name": made.model,
+            "weights_sha256": made.weights_sha256,
+            "engine": made.engine,
+            "provider": made.provider,
+        },
+        "options": {
+            "output": [each.value for each in job.options.outputs],
+            "iterations": job.options.iterations,
+            "metrics": job.options.metrics,
+            "on_error": job.options.on_error.value,
+        },
+        "source": job.source,
+        "upload_sha256": job.upload_sha256,
+        "rig": None if rig is None else dataclasses.asdict(rig),
+        "left_from_rectified": None if rotation is None else rotation.rotation.tolist(),
+        "axes": "OPENCV",
+        "units": {"length": "m", "time": "ns", "disparity": "px of the rectified left image"},
+        "precision": f"disparity and sigma are rounded to 1/{STEPS_PER_PX} px: a map equals that "
+        "of a lossless live stream of the same frames, rounded to it",
+        "counts": {
+            "frames": job.frames,
+            "done": status.frames_done,
+            "failed": job.frames_failed,
+            "cold": job.cold_frames,
+        },
+        "times": {
+            "created": _time(job.created_s),
+            "started": _time(job.started_s),
+            "finished": _time(job.finished_s),
+            "frames_per_s": status.fps,
+            "source_frames_per_s": job.source_fps,
+        },
+        "accuracy": None if job.accuracy is None else dict(job.accuracy),
+        "warnings": [{"kind": each.kind.value, "message": each.message} for each in job.warnings],
+        "notes": list(job.notes),
+    }
+
+
+def zip_of(status: JobStatus, folder: Path, form: ResultFormat) -> Iterator[bytes]:
+    """Make a zip in a layout, and yield it in pieces.
+
+    Raises BadShape before the first piece: the job has not kept what the layout needs.
+    """
+    layout = LAYOUTS[form](about_of(manifest_of(status, folder)))
+    return _zipping(layout.frame, layout.end, folder)
+
+
+def _zipping(frame_files: Any, last_files: Any, folder: Path) -> Iterator[bytes]:
+    sink = _Sink()
+    with zipfile.ZipFile(sink, "w") as archive:
+        for frame in read_frames(folder):
+            for file in frame_files(frame):
+                archive.writestr(zipfile.ZipInfo(file.name), file.content)
+            yield sink.take()
+        for file in last_files():
+            archive.writestr(zipfile.ZipInfo(file.name), file.content)
+    yield sink.take()
+
+
+def mp4_of(job: Job, folder: Path) -> Iterator[bytes]:
+    """Make a film of disparity, and yield it in pieces, which are empty while frames are encoded.
+
+    Raises CannotEncode before the first piece.
+    """
+    with tempfile.TemporaryDirectory() as scratch:
+        path = Path(scratch) / "disparity.mp4"
+        maps = (frame.disparity for frame in read_frames(folder))
+        planes = (each.offset_px for each in maps if each is not None)
+        for _ in _writing_mp4(path, planes, job.source_fps or _FILM_FPS):
+            yield b""
+        with path.open("rb") as file:
+            while chunk := file.read(_CHUNK):
+                yield chunk
+
+
+def _time(unix_s: float | None) -> str | None:
+    return None if unix_s is None else datetime.fromtimestamp(unix_s, UTC).isoformat()
+
+
+def _writing_mp4(path: Path, frames: Iterator[Plane], fps: float) -> Iterator[None]:
+    low = high = 0.0
+    try:
+        film = FilmWriter(path, fps=fps)
+    except CannotFilm as error:
+        raise CannotEncode(f"{error}; choose another format") from None
+    with film:
+        for index, offset_px in enumerate(frames):
+            known = np.isfinite(offset_px)
+            if index == 0 and known.any():
+                low, high = np.percentile(offset_px[known], _COLOUR_RANGE_PCT)
+            share = (np.nan_to_num(offset_px) - low) / max(high - low, 1e-6)
+            levels = (255 * np.clip(share, 0, 1)).astype(np.uint8)
+            colours = np.asarray(cv2.applyColorMap(levels, cv2.COLORMAP_TURBO), np.uint8)
+            colours[~known] = 0
+            film.add(colours[..., ::-1])  # BGR to RGB
+            yield
+
+
+class _Sink(io.RawIOBase):
+    """A file for zipfile that cannot seek. It is emptied between frames."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._pieces: list[bytes] = []
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: Any) -> int:  # anything with a buffer, as in the base class
+        piece = bytes(data)
+        self._pieces.append(piece)
+        return len(piece)
+
+    def take(self) -> bytes:
+        taken = b"".join(self._pieces)
+        self._pieces.clear()
+        return taken
