@@ -198,7 +198,7 @@ def exported_parts(
 ) -> StepParts[ModelProto]:
     """The graphs that :func:`stitched` takes, batch norms folded.
 
-    ``on_step`` is told of each part before it is traced.
+    ``on_step`` gets the name of each part before it is traced.
     """
     match folded(network):
         case LiteNetwork() as lite:

@@ -1,4 +1,4 @@
-"""What a caller is told about an error that is none of its own."""
+"""The error that a caller gets for a failure that the caller did not cause."""
 
 import errno
 import logging

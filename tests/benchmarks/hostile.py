@@ -151,7 +151,7 @@ async def serving(zenoh_endpoint: str | None) -> AsyncIterator[Server]:
 
 
 class Child:
-    """This file in a process of its own, with one stream, until it is told to stop."""
+    """This file in a process of its own, with one stream, until it is stopped."""
 
     def __init__(self, process: asyncio.subprocess.Process) -> None:
         self._process = process

@@ -176,8 +176,8 @@ async def clients_of(server: Server, *, seed: int, seconds: float) -> dict[str, 
     )
     out, _ = await process.communicate()
     assert process.returncode == 0, "the clients failed; the lines above say why"
-    told: dict[str, Any] = json.loads(out)
-    return told
+    figures: dict[str, Any] = json.loads(out)
+    return figures
 
 
 async def settled(server: Server, before: Sample | None) -> Sample:

@@ -156,7 +156,7 @@ print(depth())
 
 
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="needs fork")
-def test_a_process_forked_after_a_client_was_opened_is_told_so(server: str) -> None:
+def test_a_process_forked_after_a_client_was_opened_gets_an_error(server: str) -> None:
     done = subprocess.run(
         [sys.executable, "-c", FORKS, server],
         capture_output=True,

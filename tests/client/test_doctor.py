@@ -11,13 +11,13 @@ from vergence.cli.doctor import doctor
 from vergence_service.app.server import Running
 
 
-async def told(server: str) -> str:
+async def printed(server: str) -> str:
     text = io.StringIO()
     await doctor(server, Console(file=text, width=200))
     return text.getvalue()
 
 
-async def test_the_ports_of_a_running_server_are_told_from_those_of_others(
+async def test_the_ports_of_a_running_server_are_distinguished_from_those_of_others(
     server: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     grpc, http = (
@@ -27,7 +27,7 @@ async def test_the_ports_of_a_running_server_are_told_from_those_of_others(
         taken = other.getsockname()[1]
         ports = {grpc: "gRPC", http: "HTTP", taken: "other"}
         monkeypatch.setattr(doctor_module, "_PORTS", ports)
-        lines = (await told(server.grpc_address)).splitlines()
+        lines = (await printed(server.grpc_address)).splitlines()
     for port in (grpc, http):
         assert any(f"127.0.0.1:{port}: a Vergence server" in line for line in lines)
     assert any(f"127.0.0.1:{taken} is taken by another program" in line for line in lines)

@@ -123,7 +123,9 @@ def test_a_rig_takes_what_stereo_calibrate_returns() -> None:
 @pytest.mark.parametrize(
     "capture_ns", [1403636579.7635555, 1.5, "now", 2**63, math.nan, np.float64(3)], ids=repr
 )
-async def test_a_time_that_is_no_whole_number_is_told(capture_ns: Any, client: DepthClient) -> None:
+async def test_a_time_that_is_no_whole_number_is_reported(
+    capture_ns: Any, client: DepthClient
+) -> None:
     async with client.open_session(RIG, delivery=Delivery.EVERY) as session:
         with pytest.raises(BadShape, match="nanoseconds"):
             await session.step(FRAME.left, FRAME.right, capture_ns=capture_ns)
@@ -159,7 +161,7 @@ async def test_a_recording_has_times_of_its_own(
 
 
 @pytest.mark.parametrize("per_second", [1_000, 1_000_000])
-async def test_times_of_another_unit_are_told_once(
+async def test_times_of_another_unit_are_reported_once(
     per_second: int, client: DepthClient, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with client.open_session(RIG, delivery=Delivery.EVERY) as session:
@@ -170,13 +172,15 @@ async def test_times_of_another_unit_are_told_once(
     assert "is capture_ns in nanoseconds?" in record.message
 
 
-async def test_a_baseline_in_millimetres_is_told(
+async def test_a_baseline_in_millimetres_is_reported(
     client: DepthClient, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.WARNING)
-    for baseline_m, told in ((0.1, False), (9.9, False), (100.0, True)):
+    for baseline_m, warned in ((0.1, False), (9.9, False), (100.0, True)):
         rig = RectifiedRig(640, 480, 400, 400, 320, 320, 240, baseline_m)
         for each in (rig, StereoRig.from_rectified(rig)):
             caplog.clear()
             client.open_session(each)
-            assert [("millimetres" in record.message) for record in caplog.records] == [True] * told
+            assert [("millimetres" in record.message) for record in caplog.records] == [
+                True
+            ] * warned

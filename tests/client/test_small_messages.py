@@ -102,7 +102,9 @@ async def test_sessions_on_this_machine_and_lossless_ones_are_exact(delivery: De
     np.testing.assert_array_equal(here.disparity_px, there.disparity_px)
 
 
-async def test_the_images_are_copied_and_mistakes_are_told_before_a_thread_encodes_them() -> None:
+async def test_the_images_are_copied_and_mistakes_are_reported_before_a_thread_encodes_them() -> (
+    None
+):
     model, frame = SeeingModel(), make_frame(1)
     left, right = frame.left.copy(), frame.right.copy()
     async with elsewhere(model) as client, client.open_session(RIG) as session:

@@ -153,7 +153,7 @@ async def test_a_camera_is_live_and_stamps_its_pictures() -> None:
         (["camera:TMP/a.png"], "96x96: expected the left and the right view side by side"),
     ],
 )
-def test_what_is_no_source_is_told(texts: list[str], says: str, tmp_path: Path) -> None:
+def test_what_is_no_source_is_reported(texts: list[str], says: str, tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((96, 96, 3), np.uint8))
     (tmp_path / "a.zip").write_bytes(b"PK")
     with pytest.raises(CliError, match=says):

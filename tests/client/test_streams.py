@@ -36,7 +36,7 @@ async def test_waiting_in_vain_for_a_place_says_how_long_to_wait() -> None:
         assert refused.value.retry_after_s > 0
 
 
-async def test_the_server_tells_about_itself_and_its_streams(
+async def test_the_server_describes_itself_and_its_streams(
     client: DepthClient, model: RecallModel
 ) -> None:
     async with client.open_session(RIG, stream_id="hall") as session:
@@ -98,7 +98,7 @@ async def test_an_idle_stream_expires_after_a_notice() -> None:
     assert 0 < events[0].in_s <= 10
 
 
-async def test_an_end_that_meets_what_the_client_sends_is_told_as_what_it_is() -> None:
+async def test_an_end_that_meets_what_the_client_sends_is_reported_as_what_it_is() -> None:
     async def send_without_pause(session: DepthSession) -> None:
         while True:
             session.reset()

@@ -38,7 +38,7 @@ def test_what_was_dropped_or_refused_is_not_lost(unanswered: Unanswered) -> None
     assert unanswered.answered(a_map(3)) == []
 
 
-def test_a_pong_tells_lost_from_late_among_the_frames_before_its_ping(
+def test_a_pong_separates_lost_from_late_among_the_frames_before_its_ping(
     unanswered: Unanswered,
 ) -> None:
     assert unanswered.answered(a_pong(100, 2)) == [1]

@@ -80,7 +80,7 @@ async def test_one_failure_does_not_stop_the_others_and_is_reported(tmp_path: Pa
 
 
 @pytest.mark.parametrize("name", ["nothing", "empty", "text.txt"])
-async def test_what_holds_no_sequence_is_told_before_anything_is_sent(
+async def test_what_holds_no_sequence_is_reported_before_anything_is_sent(
     tmp_path: Path, name: str
 ) -> None:
     (tmp_path / "empty").mkdir()

@@ -211,7 +211,7 @@ def test_run_at_a_rate_accounts_for_every_frame(wall: Path, server: str, tmp_pat
     ],
     ids=["kind", "folder", "rate", "scheme", "nobody-there", "unwritable", "demo"],
 )
-def test_what_a_person_got_wrong_is_told_without_a_trace(
+def test_what_a_person_got_wrong_is_reported_without_a_trace(
     wall: Path, tmp_path: Path, arguments: list[str], code: int, expected: str
 ) -> None:
     done = vergence(
@@ -265,7 +265,7 @@ def test_run_writes_the_maps_and_values_that_are_asked_for(
         ("fastapi", ["serve"], "vergence[server]"),
     ],
 )
-def test_what_is_not_installed_is_told_with_the_extra_that_brings_it(
+def test_what_is_not_installed_is_reported_with_the_extra_that_brings_it(
     missing: str, arguments: list[str], extra: str
 ) -> None:
     done = vergence(*arguments, without=missing)
@@ -275,7 +275,7 @@ def test_what_is_not_installed_is_told_with_the_extra_that_brings_it(
     assert "Traceback" not in done.stderr
 
 
-def test_no_server_to_start_is_told_with_the_extra_that_brings_it(
+def test_no_server_to_start_is_reported_with_the_extra_that_brings_it(
     wall: Path, tmp_path: Path
 ) -> None:
     done = vergence("run", f"vergence:{wall}", without="vergence_service", cwd=tmp_path)

@@ -151,7 +151,7 @@ async def test_a_draining_server_says_so_and_ends_the_call() -> None:
     assert EventKind.DRAINING in [event.kind for event in events]
 
 
-async def test_a_server_that_is_none_of_ours_is_told_apart() -> None:
+async def test_a_server_that_is_none_of_ours_is_recognised() -> None:
     async with asyncio.timeout(10):
         listener = await asyncio.start_server(_answers_like_a_stranger, "127.0.0.1", 0)
         port = listener.sockets[0].getsockname()[1]

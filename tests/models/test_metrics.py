@@ -99,7 +99,7 @@ def test_holes_take_the_farther_side() -> None:
     assert filled(row).tolist() == [[5, 5, 3, 3, 3, 3], [0, 0, 0, 0, 0, 0]]
 
 
-def test_the_command_tells_of_every_method(
+def test_the_command_reports_every_method(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_shard(tmp_path / "pool" / "shard_1_000000", wall_clips(1, height=192, width=256))

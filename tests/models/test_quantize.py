@@ -219,11 +219,11 @@ def test_a_scale_covers_its_range_and_zero_is_exact(low: float, high: float) -> 
     assert ends[1] >= max(high, 0.0) - tolerance
 
 
-def test_graphs_are_made_and_the_loss_is_told(pool: ClipPool) -> None:
+def test_graphs_are_made_and_the_loss_is_reported(pool: ClipPool) -> None:
     wall = wall_model()
     before = wall.SerializeToString()
     steps: list[str] = []
-    models, told = make_int8(
+    models, entry = make_int8(
         {StepKind(1): wall, StepKind(2): wall},
         STATES,
         pool,
@@ -234,7 +234,7 @@ def test_graphs_are_made_and_the_loss_is_told(pool: ClipPool) -> None:
         *("ranges", "rounding", "loss"),
         *("ranges", "rounding"),
     ]
-    story = cast("dict[str, Any]", told)
+    story = cast("dict[str, Any]", entry)
     assert story["convolutions"] == 3
     assert story["measured_clips"] == 2
     assert 0 < story["float_epe_px"] < 1

@@ -264,12 +264,12 @@ def test_a_stopped_run_goes_on_and_keeps_what_is_there(rendered: Path) -> None:
     lost = rendered / "frames_cleanpass" / TINY.name / "left" / "0000.png"
     assert len(first) > 8
 
-    told: list[int] = []
+    frames: list[int] = []
     longer = dataclasses.replace(TINY, frames=2)
     render_sequence(
-        longer, rendered, passes=("clean",), variant="scalar_rgb", on_frame=lambda: told.append(1)
+        longer, rendered, passes=("clean",), variant="scalar_rgb", on_frame=lambda: frames.append(1)
     )
-    assert len(told) == 2
+    assert len(frames) == 2
     assert {path: path.stat().st_mtime_ns for path in first} == first
     assert (rendered / "disparity" / TINY.name / "right" / "0001.pfm").exists()
 

@@ -175,8 +175,8 @@ def test_normals_of_planes_are_those_of_their_depth(name: str) -> None:
     mine = (here.label == label_of(name)).astype(np.uint8)
     inner = cv2.erode(mine, np.ones((3, 3), np.uint8))[1:-1, 1:-1].astype(bool)
     # Frames and edges of the same thing have other normals; most of its pixels are its plane.
-    told = here.normals[1:-1, 1:-1]
-    close = np.einsum("hwk,hwk->hw", normal, told)[inner] > 1 - 1e-3
+    expected = here.normals[1:-1, 1:-1]
+    close = np.einsum("hwk,hwk->hw", normal, expected)[inner] > 1 - 1e-3
     assert close.size > 5
     assert close.mean() > 0.85
 

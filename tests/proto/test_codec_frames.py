@@ -97,7 +97,7 @@ class TestFrames:
             codec.frame_from_proto(message, max_bytes=2 * 144)
 
     @pytest.mark.parametrize("side", ["left", "right"])
-    def test_a_damaged_image_is_told_by_its_side(self, side: str) -> None:
+    def test_a_damaged_image_is_reported_by_its_side(self, side: str) -> None:
         message = a_frame_message()
         getattr(message, side).data = b"short"
         with pytest.raises(BadImage, match=f"^{side} image: .*got 5"):
@@ -148,7 +148,7 @@ class TestDisparity:
         assert back.world_from_left is None
 
     @pytest.mark.parametrize("plane", ["disparity", "confidence", "sigma"])
-    def test_a_plane_of_another_size_is_told_by_its_name(self, plane: str) -> None:
+    def test_a_plane_of_another_size_is_reported_by_its_name(self, plane: str) -> None:
         output = OutputFormat(confidence=True, sigma=True)
         message = codec.disparity_to_proto(a_map(), output)
         getattr(message, plane).width = 9

@@ -208,7 +208,7 @@ class TestSomeFramesOfASequence:
         poses.write_text("\n".join(poses.read_text().splitlines()[4:7]))
         assert_poses(open_source(f"{kind}:{folder}"), trees.some_poses(10)[4:7])
 
-    def test_frames_beyond_the_poses_have_none_and_a_note_tells(
+    def test_frames_beyond_the_poses_have_none_and_a_note_says_so(
         self, kind: str, tmp_path: Path
     ) -> None:
         folder = self._later(kind, tmp_path, 0, 3)
@@ -255,7 +255,7 @@ class TestSceneFlow:
         assert source[0].frame.pose is None
         assert_truth(source, 0, trees.a_disparity(0, 960, 540))
 
-    def test_a_frame_without_truth_has_none_and_a_note_tells(self, tmp_path: Path) -> None:
+    def test_a_frame_without_truth_has_none_and_a_note_says_so(self, tmp_path: Path) -> None:
         folder = trees.sceneflow_sequence(tmp_path)
         (tmp_path / "disparity/TRAIN/A/0000/left/0007.pfm").unlink()
         source = open_source(f"sceneflow:{folder}?fx=20")
@@ -429,7 +429,7 @@ def test_a_damaged_first_image_leaves_the_others(kind: str, tmp_path: Path) -> N
     np.testing.assert_array_equal(again[1].frame.left, source[1].frame.left)
 
 
-def test_a_turned_pose_matrix_is_told(tmp_path: Path) -> None:
+def test_a_turned_pose_matrix_is_reported(tmp_path: Path) -> None:
     folder = trees.vergence_sequence(tmp_path)
     turned = Pose(np.eye(3), np.array([0.3, 0.0, 0.5])).matrix.T
     lines = [trees.words(turned)] * 3

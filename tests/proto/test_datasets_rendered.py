@@ -55,9 +55,9 @@ class TestSceneFlow:
         source = open_source(f"sceneflow:{folder}")
         assert (rig_of(source).fx, source.fps, source.metric) == (21.5, 20, True)
         assert source[1].frame.capture_ns - source[0].frame.capture_ns == 50_000_000
-        assert rig_of(open_source(f"sceneflow:{folder}?fx=20")).fx == 20  # whoever asks, gets it
+        assert rig_of(open_source(f"sceneflow:{folder}?fx=20")).fx == 20  # the asked one
 
-    def test_mirrors_are_not_judged_where_the_data_tells_of_them(self, tmp_path: Path) -> None:
+    def test_mirrors_are_not_judged_where_the_data_names_them(self, tmp_path: Path) -> None:
         folder = trees.sceneflow_sequence(tmp_path)
         specular = np.zeros((trees.HEIGHT, trees.WIDTH), np.uint8)
         specular[3:5, 7:9] = 255

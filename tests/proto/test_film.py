@@ -72,7 +72,7 @@ def test_a_file_that_cannot_be_made_is_named(tmp_path: Path) -> None:
         FilmWriter(tmp_path / "none" / "film.mp4", fps=30)
 
 
-def test_what_is_missing_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_missing_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(film, "_ENCODERS", {"libnothing": {}})
     with pytest.raises(CannotFilm, match="none of the encoders libnothing"):
         FilmWriter(tmp_path / "film.mp4", fps=30)

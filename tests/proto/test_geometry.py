@@ -196,7 +196,7 @@ def test_the_warp_in_disparity_space_is_the_motion_of_points(
         np.testing.assert_allclose(moved[:3] / moved[3], expected, rtol=1e-5, atol=FLOAT32_PX)
 
 
-def test_the_previous_rig_is_the_same_one_unless_told() -> None:
+def test_the_previous_rig_is_the_same_one_unless_given() -> None:
     rig = RectifiedRig(640, 480, 400, 410, 320, 300, 240, 0.1)
     motion = Pose(rotation_about((0, 1, 0), 0.1), np.array([0.1, 0, 0.2]))
     np.testing.assert_array_equal(

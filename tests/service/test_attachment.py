@@ -120,7 +120,7 @@ async def test_an_idle_stream_is_warned_and_then_expires() -> None:
     assert reason_of(failure.value) == "STREAM_EXPIRED"
 
 
-async def test_the_newest_attachment_wins_and_the_older_is_told() -> None:
+async def test_the_newest_attachment_wins_and_the_older_is_reported() -> None:
     async with running_server(RecallModel()) as server, raw_stream(server, "mine") as older:
         await older.ask(frame_message(make_frame(1)))
         token = older.opened.resume_token

@@ -78,7 +78,7 @@ async def test_a_message_far_over_the_limit_ends_the_call_and_keeps_the_stream()
 
 
 @pytest.mark.parametrize("method", ["GetStream", "ResetStream", "CloseStream"])
-async def test_an_unknown_stream_is_told_as_such(method: str) -> None:
+async def test_an_unknown_stream_is_reported_as_such(method: str) -> None:
     async with running_server(RecallModel()) as server, connected(server) as stub:
         request = getattr(pb, f"{method}Request")(stream_id="nowhere")
         with pytest.raises(grpc.aio.AioRpcError) as failure:

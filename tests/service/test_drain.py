@@ -35,7 +35,7 @@ SERVING = health_pb2.HealthCheckResponse.SERVING
 NOT_SERVING = health_pb2.HealthCheckResponse.NOT_SERVING
 
 
-async def test_a_drain_tells_answers_what_is_in_flight_and_ends_the_call() -> None:
+async def test_a_drain_says_so_answers_what_is_in_flight_and_ends_the_call() -> None:
     model = RecallModel()
     async with running_server(model) as server, raw_stream(server, "mine") as call:
         with model.busy():
@@ -88,7 +88,7 @@ async def test_health_is_watched_from_serving_to_draining() -> None:
     assert seen == [SERVING, NOT_SERVING]
 
 
-async def test_http_tells_life_readiness_and_counts() -> None:
+async def test_http_reports_life_readiness_and_counts() -> None:
     async with running_server(RecallModel()) as server, raw_stream(server) as call:
         await call.ask(frame_message(make_frame(1)))
         late = frame_message(make_frame(1))
@@ -115,7 +115,7 @@ async def test_a_second_server_on_a_port_fails_and_says_so(transport: str) -> No
             await running_server(RecallModel(), **taken).__aenter__()
 
 
-async def test_an_address_of_another_machine_is_told_apart_from_a_port_that_is_taken() -> None:
+async def test_an_address_of_another_machine_is_distinguished_from_a_port_that_is_taken() -> None:
     with pytest.raises(PortTaken, match="choose another address with --host"):
         await running_server(RecallModel(), server__host="203.0.113.1").__aenter__()
 
@@ -145,7 +145,7 @@ SMALL = (
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=lambda number: number.name)
-def test_the_process_tells_its_addresses_and_ends_cleanly_on_a_signal(
+def test_the_process_reports_its_addresses_and_ends_cleanly_on_a_signal(
     number: signal.Signals,
 ) -> None:
     with served(*SMALL) as process:
@@ -260,7 +260,7 @@ async def test_a_server_starts_and_ends_where_no_event_loop_handles_signals(
     ],
     ids=["no-file", "no-model", "no-weights", "bad-port", "taken-port"],
 )
-def test_what_an_operator_can_mend_is_told_in_one_line(arguments: list[str], says: str) -> None:
+def test_what_an_operator_can_mend_is_reported_in_one_line(arguments: list[str], says: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         taken = str(other.getsockname()[1])
         words = [word.replace("TAKEN", taken) for word in arguments]

@@ -190,7 +190,7 @@ async def test_poses_come_in_and_go_out_in_the_axes_of_the_stream(axes: Axes) ->
             )
 
 
-async def test_a_reset_takes_effect_at_the_next_frame_and_is_told() -> None:
+async def test_a_reset_takes_effect_at_the_next_frame_and_is_reported() -> None:
     async with running_server(RecallModel()) as server:
         await server.engine.open("a", OPENING)
         await step(server.engine, "a", make_frame(1))

@@ -103,7 +103,7 @@ async def test_a_sequence_gets_what_its_frames_get_over_grpc_however_it_is_packe
             np.testing.assert_array_equal(disparities_in(answer.content), as_kept(streamed), packed)
 
 
-async def test_a_job_tells_how_far_it_is_and_ends_with_its_result() -> None:
+async def test_a_job_reports_how_far_it_is_and_ends_with_its_result() -> None:
     model = RecallModel()
     async with http_server(model) as client:
         with model.busy():

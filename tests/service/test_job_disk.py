@@ -131,7 +131,9 @@ async def test_what_the_disk_has_no_room_for_is_refused_before_it_is_accepted(
     ],
     ids=["full", "read-only", "failing", "missing", "another"],
 )
-def test_trouble_of_the_disk_is_told_from_other_errors(error: Exception, says: str | None) -> None:
+def test_trouble_of_the_disk_is_distinguished_from_other_errors(
+    error: Exception, says: str | None
+) -> None:
     def bad_sequence() -> BadSequence:
         try:
             try:

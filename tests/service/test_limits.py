@@ -39,7 +39,7 @@ async def test_a_full_server_says_when_to_come_back() -> None:
     assert 0 < seconds_to_wait(failure.value) <= 60
 
 
-async def test_a_client_that_has_its_share_is_told_so_and_leaves_room_to_others() -> None:
+async def test_a_client_that_has_its_share_is_refused_and_leaves_room_to_others() -> None:
     async with (
         running_server(RecallModel(), limits__streams_per_client=1) as server,
         raw_stream(server, "mine") as mine,

@@ -106,7 +106,7 @@ SERVICE_LINKS = {
 }
 
 
-def test_what_an_orchestrator_tells_of_its_services_is_no_setting(
+def test_what_an_orchestrator_says_of_its_services_is_no_setting(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     before = load_settings().model_dump()
@@ -118,7 +118,7 @@ def test_what_an_orchestrator_tells_of_its_services_is_no_setting(
 @pytest.mark.parametrize(
     "name", ["VERGENCE_GRPC_PORT", "VERGENCE_PORT", "VERGENCE_MODEL_NAME", "VERGENCE_LOGLEVEL"]
 )
-def test_a_setting_with_too_few_underscores_is_told(
+def test_a_setting_with_too_few_underscores_is_reported(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(name, "50052")

@@ -204,7 +204,7 @@ async def test_end_answers_what_was_sent_and_frees_the_stream() -> None:
             assert (await stub.GetServerInfo(pb.GetServerInfoRequest())).streams_open == 0
 
 
-async def test_a_ping_tells_how_long_it_was_held() -> None:
+async def test_a_ping_reports_how_long_it_was_held() -> None:
     async with running_server(RecallModel()) as server, raw_stream(server) as call:
         answer = await call.ask(pb.StreamDepthRequest(ping=pb.Ping(client_ns=42)))
         assert answer.pong.client_ns == 42
@@ -230,7 +230,7 @@ async def test_the_timings_of_a_frame_add_up() -> None:
         assert parts <= timings.total_us + 4  # each is rounded
 
 
-async def test_get_stream_tells_of_a_stream_without_touching_it() -> None:
+async def test_get_stream_describes_a_stream_without_touching_it() -> None:
     async with (
         running_server(RecallModel()) as server,
         connected(server) as stub,

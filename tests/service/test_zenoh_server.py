@@ -217,7 +217,7 @@ async def refused(**flags: Any) -> AsyncIterator[Running]:
         yield server
 
 
-async def test_what_an_operator_can_mend_is_told_in_one_line(
+async def test_what_an_operator_can_mend_is_reported_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     endpoint = free_endpoint()

@@ -1,4 +1,4 @@
-"""The end of a command by a signal: it cleans up as after Ctrl-C, and the exit code tells."""
+"""The end of a command by a signal: it cleans up as after Ctrl-C, and the exit code says so."""
 
 import asyncio
 from collections.abc import Coroutine

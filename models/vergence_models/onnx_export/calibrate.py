@@ -50,7 +50,7 @@ def make_int8(
 ) -> tuple[dict[StepKind, ModelProto], dict[str, object]]:
     """Int8 graphs of float graphs, and their entry of the manifest.
 
-    ``on_step`` is told of each part of the work before it begins.
+    ``on_step`` gets the name of each part of the work before it begins.
 
     Raises QuantizationError if the smallest loses more than :data:`MAX_LOSS`, or if a product in
     any of them may overflow 16 bits.

@@ -148,9 +148,9 @@ class Trainer:
     def start_from(self, folder: Path) -> list[str]:
         """Take over the averaged weights and the story of another run, of fewer parts perhaps.
 
-        The optimizer begins anew, the learning rate goes on by the run's steps. Returns the names
-        of weights that the run lacks, which begin untrained. Raises RunError if its configuration
-        differs.
+        The optimizer starts from zero. The learning rate goes on by the run's steps. Returns the
+        names of weights that the run lacks, which begin untrained. Raises RunError if its
+        configuration differs.
         """
         contents = load_checkpoint(folder)
         path = folder / CHECKPOINT_NAME

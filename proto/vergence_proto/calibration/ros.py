@@ -1,7 +1,7 @@
 """ROS: the CameraInfo of a left and a right camera.
 
 ``camera_calibration`` writes YAML with ``image_width`` and ``camera_matrix``; a printed message has
-``width`` and ``k`` (ROS 1: ``K``). Only R and P tell where the right camera is: ``P[3]`` of the
+``width`` and ``k`` (ROS 1: ``K``). Only R and P state where the right camera is: ``P[3]`` of the
 right one is ``-fx * baseline``. http://wiki.ros.org/image_pipeline/CameraInfo
 """
 

@@ -109,7 +109,7 @@ def notes_on_poses(path: Path, poses: Sequence[object | None]) -> tuple[str, ...
 
 
 def is_data(name: str) -> bool:
-    """Tell whether a file or folder belongs to the data, and was not added by a system."""
+    """Decide whether a file or folder belongs to the data, and was not added by a system."""
     return not (name.startswith(".") or name == "__MACOSX")
 
 

@@ -38,7 +38,7 @@ def find_all(root: Path) -> list[Path]:
 
 
 def is_eth3d(path: Path) -> bool:
-    """Tell whether a scene with this calibration is ETH3D's, by the files and folders about it."""
+    """Decide by its files and folders whether a scene with this calibration is ETH3D's."""
     parent = path.absolute().parent.name
     return (path / "cameras.txt").is_file() or parent.startswith("two_view")
 

@@ -1,6 +1,6 @@
 """Files for the standard library to read, that give no more than their limits.
 
-``zipfile`` and ``tarfile`` read as much at once as an archive tells them to, and an .xz file may
+``zipfile`` and ``tarfile`` read as much at once as an archive asks for, and an .xz file may
 ask for gigabytes of dictionary.
 """
 

@@ -285,7 +285,7 @@ class StreamTable:
 
 
 def _in_use(stream: Stream) -> bool:
-    """Tell whether a frame of the stream waits or is stepped."""
+    """Decide whether a frame of the stream waits or is stepped."""
     return stream.turn.locked() or (stream.attachment is not None and stream.attachment.busy)
 
 

@@ -55,7 +55,7 @@ def _close_connection(peer: str) -> bool:
 
 
 def _is_peer(name: Any, host: str, port: str) -> bool:
-    """Tell whether a socket's name is this address. IPv4 may be written as IPv6."""
+    """Decide whether a socket's name is this address. IPv4 may be written as IPv6."""
     return (
         isinstance(name, tuple)
         and str(name[1]) == port
