@@ -90,14 +90,6 @@ def test_demo_ends_with_a_picture_a_video_and_a_table(wall: Path, tmp_path: Path
         assert sum(1 for _ in film.decode(video=0)) == 3
 
 
-def test_demo_needs_nothing_but_what_was_installed(tmp_path: Path) -> None:
-    done = vergence("demo", "--frames", 2, "--out", tmp_path, "--json", tmp_path / "figures.json")
-    assert done.returncode == 0, done.stderr
-    figures = json.loads((tmp_path / "figures.json").read_text())
-    assert figures["frames"] == 2
-    assert figures["epe_px"] is not None  # the bundled sample has its truth
-
-
 def test_run_writes_every_frame_losslessly(wall: Path, server: str, tmp_path: Path) -> None:
     done = vergence(
         *("run", f"vergence:{wall}", "--server", server, "--out", tmp_path / "out"),
