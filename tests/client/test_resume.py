@@ -23,7 +23,7 @@ async def test_a_cut_connection_resumes_with_the_state_as_it_was() -> None:
         await rough.until(EventKind.DISCONNECTED)
         rough.proxy.mend()
         results += [await step(session, frame_id) for frame_id in (4, 5, 6)]
-        assert rough.proxy.accepted == 2
+        assert rough.proxy.accepted >= 2
     for result, same in zip(results, expected, strict=True):
         np.testing.assert_array_equal(result.disparity_px, same.disparity_px)
         assert result.step_count == same.step_count
