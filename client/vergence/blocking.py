@@ -7,7 +7,8 @@ import asyncio
 import os
 import threading
 from collections.abc import Callable, Coroutine
-from typing import Any, Literal, Self, TypeVar
+from pathlib import Path
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -280,15 +281,26 @@ class BlockingClient:
     ----------
     server
         The address of the server, as in :class:`DepthClient`.
+    token, ca, cert, key
+        The client's credentials, as in :class:`DepthClient`.
 
     Raises
     ------
     ValueError
-        ``server`` is no such address, or the package that its scheme needs is not installed.
+        ``server`` is no such address, the package that its scheme needs is not installed, a file
+        cannot be read, or the token would be sent over a network in the clear.
     """
 
-    def __init__(self, server: str = DEFAULT_SERVER) -> None:
-        self._client = DepthClient(server)
+    def __init__(
+        self,
+        server: str = DEFAULT_SERVER,
+        *,
+        token: str | None = None,
+        ca: str | Path | None = None,
+        cert: str | Path | None = None,
+        key: str | Path | None = None,
+    ) -> None:
+        self._client = DepthClient(server, token=token, ca=ca, cert=cert, key=key)
         self._loop = _LoopThread()
 
     def __enter__(self) -> Self:
@@ -324,7 +336,6 @@ class BlockingClient:
         resume_token: bytes = b"",
         on_event: Callable[[SessionEvent], None] | None = None,
         on_lost: OnLost = "restart",
-        link: Literal["auto", "fixed"] | None = None,
         open_timeout_s: float = 10.0,
     ) -> BlockingSession:
         """Make a session; its ``with`` opens the stream and ends it.
@@ -363,12 +374,6 @@ class BlockingClient:
             What to do when the server does not have the stream any more, because it was restarted
             or has discarded the stream. ``"restart"``: go on with a new stream, whose first result
             is a cold start. ``"raise"``: end the session with the error.
-        link
-            ``"auto"``: measure the link, send frames at the pace of its slowest part, and choose
-            the quality of JPEG, half size and ``map_step`` by what it takes, unless ``encoding``,
-            ``jpeg_quality`` or ``output.map_step`` fix them. ``"fixed"``: send what was asked for,
-            within the credit. Default: ``"auto"`` for live sessions with a server elsewhere.
-            :attr:`BlockingSession.link` shows the choice.
         open_timeout_s
             The time in seconds for which a server that cannot be reached, is not ready or has no
             room is asked again.
@@ -396,7 +401,6 @@ class BlockingClient:
             resume_token=resume_token,
             on_event=on_event,
             on_lost=on_lost,
-            link=link,
             open_timeout_s=open_timeout_s,
         )
         return BlockingSession(session, self._loop)
@@ -418,6 +422,8 @@ class BlockingClient:
     def stream_info(self, stream_id: str) -> StreamInfo:
         """Return the counters of one stream.
 
+        Without a token, only a stream that this client opened is known to the server.
+
         Raises
         ------
         UnknownStream
@@ -432,7 +438,10 @@ class BlockingClient:
         return self._loop.wait(self._client.stream_info(stream_id))
 
     def close_stream(self, stream_id: str) -> None:
-        """End a stream, even one that another client holds, and free its state.
+        """End a stream, and free its state.
+
+        With a token, it may be held by another client of the same principal. Without one, only a
+        stream that this client opened is known to the server.
 
         Raises
         ------

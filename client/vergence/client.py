@@ -1,16 +1,17 @@
 """The client of one server, with any number of sessions."""
 
 import uuid
+import weakref
 from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
-from typing import Literal, Self
+from pathlib import Path
+from typing import Self
 
 from vergence.attaching import OnLost, RecoveryRules
 from vergence.errors import NotOpen
 from vergence.image_format import ImageFormat
 from vergence.info import ServerInfo, StreamInfo
 from vergence.info_codec import server_info_from_proto, stream_info_from_proto
-from vergence.link import LinkRules
 from vergence.results import SessionEvent
 from vergence.session import DepthSession
 from vergence.session_facts import SessionSetup
@@ -19,14 +20,7 @@ from vergence.transports.base import Transport
 from vergence.units import warn_of_baseline
 from vergence_proto import codec
 from vergence_proto.geometry import Axes, RectifiedRig
-from vergence_proto.types import (
-    Delivery,
-    ImageEncoding,
-    OutputFormat,
-    PlaneEncoding,
-    StereoRig,
-    checked_stream_id,
-)
+from vergence_proto.types import Delivery, ImageEncoding, OutputFormat, StereoRig, checked_stream_id
 from vergence_proto.v1 import depth_pb2 as pb
 
 _THREADS = 2  # one encodes while the other decodes
@@ -42,17 +36,35 @@ class DepthClient:
     server
         ``grpc://HOST:PORT``; or ``zenoh://HOST:PORT[/NAMESPACE][?config=FILE]``, the address of a
         Zenoh router or of a server that is one; or ``http://HOST:PORT`` (or ``https``), for
-        networks that let nothing else through.
+        networks that let nothing else through. ``grpcs`` and ``https`` are encrypted.
+    token
+        The token that the server asks for. Default: the environment's ``VERGENCE_TOKEN``, or the
+        content of the file ``VERGENCE_TOKEN_FILE``.
+    ca
+        PEM file of the authority that signed the server's certificate. Default: the environment's
+        ``VERGENCE_CA``, or those that this system trusts.
+    cert, key
+        PEM files of the client's own certificate, for servers that ask for one.
 
     Raises
     ------
     ValueError
-        ``server`` is no such address, or the package that its scheme needs is not installed.
+        ``server`` is no such address, the package that its scheme needs is not installed, a file
+        cannot be read, or the token would be sent over a network in the clear.
     """
 
-    def __init__(self, server: str = DEFAULT_SERVER) -> None:
+    def __init__(
+        self,
+        server: str = DEFAULT_SERVER,
+        *,
+        token: str | None = None,
+        ca: str | Path | None = None,
+        cert: str | Path | None = None,
+        key: str | Path | None = None,
+    ) -> None:
         self._server = server
-        self._connect = connector(server)
+        self._connect = connector(server, token=token, ca=ca, cert=cert, key=key)
+        self._sessions: weakref.WeakSet[DepthSession] = weakref.WeakSet()
         self._on_this_machine = on_this_machine(server)
         self._transport: Transport | None = None
         self._threads: Executor
@@ -87,7 +99,6 @@ class DepthClient:
         resume_token: bytes = b"",
         on_event: Callable[[SessionEvent], None] | None = None,
         on_lost: OnLost = "restart",
-        link: Literal["auto", "fixed"] | None = None,
         open_timeout_s: float = 10.0,
     ) -> DepthSession:
         """Make a session; its ``async with`` opens the stream and ends it.
@@ -126,12 +137,6 @@ class DepthClient:
             What to do when the server does not have the stream any more, because it was restarted
             or has discarded the stream. ``"restart"``: go on with a new stream, whose first result
             is a cold start. ``"raise"``: end the session with the error.
-        link
-            ``"auto"``: measure the link, send frames at the pace of its slowest part, and choose
-            the quality of JPEG, half size and ``map_step`` by what it takes, unless ``encoding``,
-            ``jpeg_quality`` or ``output.map_step`` fix them. ``"fixed"``: send what was asked for,
-            within the credit. Default: ``"auto"`` for live sessions with a server elsewhere.
-            :attr:`DepthSession.link` shows the choice.
         open_timeout_s
             The time in seconds for which a server that cannot be reached, is not ready or has no
             room is asked again.
@@ -145,15 +150,9 @@ class DepthClient:
         NotOpen
             The client is not open.
         """
-        if link not in (None, "auto", "fixed"):
-            raise ValueError(f"expected link as 'auto' or 'fixed', got {link!r}")
         transport = self._open_transport()
         small = delivery is Delivery.NEWEST and not self._on_this_machine
         warn_of_baseline(rig)
-        adapts = delivery is Delivery.NEWEST and (link == "auto" or (small and link is None))
-        chosen = (output or OutputFormat(compressed=adapts or not self._on_this_machine)).resolved(
-            small=small or adapts
-        )
         opening = pb.OpenStream(
             stream_id=checked_stream_id(uuid.uuid4().hex if stream_id is None else stream_id),
             resume_token=resume_token,
@@ -162,29 +161,26 @@ class DepthClient:
             ),
             axes=codec.axes_to_proto(axes),
             delivery=codec.delivery_to_proto(delivery),
-            output=codec.output_format_to_proto(chosen),
+            output=codec.output_format_to_proto(
+                (output or OutputFormat(compressed=not self._on_this_machine)).resolved(small=small)
+            ),
             iterations=iterations,
             cold_iterations=cold_iterations,
             weights_sha256=weights_sha256,
         )
-        return DepthSession(
+        session = DepthSession(
             SessionSetup(
                 transport=transport,
                 opening=opening,
                 delivery=delivery,
-                link=LinkRules(
-                    images=_image_format(encoding, jpeg_quality, small=small or adapts),
-                    map_step=chosen.map_step,
-                    adapts=adapts,
-                    fixed_images=encoding is not None or jpeg_quality is not None,
-                    fixed_maps=(output is not None and output.map_step != 0)
-                    or chosen.encoding is not PlaneEncoding.UINT16,
-                ),
+                images=_image_format(encoding, jpeg_quality, small=small),
                 threads=self._threads,
                 on_event=on_event,
                 rules=RecoveryRules(on_lost, open_timeout_s),
             )
         )
+        self._sessions.add(session)
+        return session
 
     async def server_info(self) -> ServerInfo:
         """Return the server's version, model and limits.
@@ -206,6 +202,8 @@ class DepthClient:
     async def stream_info(self, stream_id: str) -> StreamInfo:
         """Return the counters of one stream.
 
+        Without a token, only a stream that this client opened is known to the server.
+
         Raises
         ------
         UnknownStream
@@ -217,13 +215,18 @@ class DepthClient:
         NotOpen
             The client is not open.
         """
-        request = pb.GetStreamRequest(stream_id=stream_id)
+        request = pb.GetStreamRequest(
+            stream_id=stream_id, resume_token=self._resume_token(stream_id)
+        )
         transport = self._open_transport()
         response = await transport.ask("GetStream", request, pb.GetStreamResponse)
         return stream_info_from_proto(response)
 
     async def close_stream(self, stream_id: str) -> None:
-        """End a stream, even one that another client holds, and free its state.
+        """End a stream, and free its state.
+
+        With a token, it may be held by another client of the same principal. Without one, only a
+        stream that this client opened is known to the server.
 
         Raises
         ------
@@ -234,8 +237,16 @@ class DepthClient:
         NotOpen
             The client is not open.
         """
-        request = pb.CloseStreamRequest(stream_id=stream_id)
+        request = pb.CloseStreamRequest(
+            stream_id=stream_id, resume_token=self._resume_token(stream_id)
+        )
         await self._open_transport().ask("CloseStream", request, pb.CloseStreamResponse)
+
+    def _resume_token(self, stream_id: str) -> bytes:
+        """Return the secret of a stream of this client; empty if it has none of this id."""
+        theirs = (each for each in self._sessions if each.stream_id == stream_id)
+        tokens = [known for each in theirs if (known := each.known_token)]
+        return tokens[-1] if tokens else b""
 
     def _open_transport(self) -> Transport:
         if self._transport is None:

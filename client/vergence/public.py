@@ -5,7 +5,6 @@ from vergence.client import DepthClient
 from vergence.errors import NotOpen, WrongDelivery
 from vergence.filters import keep_confident, keep_range, without_speckles
 from vergence.info import ModelInfo, ServerInfo, StreamInfo
-from vergence.link import LinkState
 from vergence.reprojection import DepthView, View, reproject
 from vergence.results import (
     DepthResult,
@@ -28,6 +27,7 @@ from vergence_proto.errors import (
     DepthError,
     Draining,
     ErrorCode,
+    Forbidden,
     FrameOutOfOrder,
     FrameStale,
     FrameTooLarge,
@@ -44,6 +44,7 @@ from vergence_proto.errors import (
     StreamExpired,
     StreamLimit,
     Superseded,
+    Unauthenticated,
     UnknownSequence,
     UnknownStream,
     UploadTooLarge,
@@ -88,13 +89,13 @@ __all__ = [
     "Drops",
     "ErrorCode",
     "EventKind",
+    "Forbidden",
     "FrameOutOfOrder",
     "FrameStale",
     "FrameTooLarge",
     "ImageEncoding",
     "InsufficientStorage",
     "Intrinsics",
-    "LinkState",
     "ModelChanged",
     "ModelFailed",
     "ModelInfo",
@@ -123,6 +124,7 @@ __all__ = [
     "StreamLimit",
     "Superseded",
     "Timings",
+    "Unauthenticated",
     "UnknownSequence",
     "UnknownStream",
     "UploadTooLarge",

@@ -13,6 +13,7 @@
     |-- BadSequence, UploadTooLarge                      an uploaded sequence is refused
     |-- UnknownSequence, SequenceNotDone, QueueFull      the job or its result is not available
     |-- InsufficientStorage                              the server's disk has no room
+    |-- Unauthenticated, Forbidden                       no valid credential, or too few rights
     |-- Draining, NotReady                               not now: try again, or on another server
     `-- ModelFailed, NonFinite                           the server's own failure
 
@@ -53,6 +54,8 @@ class ErrorCode(StrEnum):
     SEQUENCE_NOT_DONE = "SEQUENCE_NOT_DONE"
     QUEUE_FULL = "QUEUE_FULL"
     INSUFFICIENT_STORAGE = "INSUFFICIENT_STORAGE"
+    UNAUTHENTICATED = "UNAUTHENTICATED"
+    FORBIDDEN = "FORBIDDEN"
 
 
 ERROR_DOMAIN = "vergence"  # google.rpc.ErrorInfo.domain
@@ -225,6 +228,18 @@ class InsufficientStorage(DepthError):
     """The disk of the server is full, read-only or failing, or too small for the upload."""
 
     code = ErrorCode.INSUFFICIENT_STORAGE
+
+
+class Unauthenticated(DepthError):
+    """The server asks for a token or a certificate, and the request has no valid one."""
+
+    code = ErrorCode.UNAUTHENTICATED
+
+
+class Forbidden(DepthError):
+    """The caller has no right to this, or a foreign web page sent the request."""
+
+    code = ErrorCode.FORBIDDEN
 
 
 ERROR_CLASSES: dict[ErrorCode, type[DepthError]] = {

@@ -24,6 +24,15 @@ def serve(
     zenoh: Annotated[
         bool | None, typer.Option("--zenoh/--no-zenoh", help="Serve over Zenoh too.")
     ] = None,
+    tokens: Annotated[
+        Path | None, typer.Option(help="File of tokens, of vergence token; clients need one.")
+    ] = None,
+    tls_cert: Annotated[Path | None, typer.Option(help="PEM file with the certificate.")] = None,
+    tls_key: Annotated[Path | None, typer.Option(help="PEM file with its key.")] = None,
+    insecure: Annotated[
+        bool | None,
+        typer.Option("--insecure", help="Listen beyond this machine without TLS or credentials."),
+    ] = None,
     model: Annotated[str | None, typer.Option(help="Model of the manifest.")] = None,
     weights: Annotated[Path | None, typer.Option(help="Folder with a manifest.")] = None,
     threads: Annotated[
@@ -47,6 +56,10 @@ def serve(
         # A flag wins over the file, whichever of these the file sets.
         **dict.fromkeys(("server.host", "grpc.host", "http.host", "zenoh.host"), host),
         "zenoh.enabled": zenoh,
+        "security.tokens": tokens,
+        "security.tls_cert": tls_cert,
+        "security.tls_key": tls_key,
+        "security.insecure": insecure,
         "model.name": model,
         "model.weights": weights,
         "model.threads": threads,

@@ -26,6 +26,10 @@ _SERVICE_LINK = re.compile(
 )
 
 
+# Variables of the client, which may be in the same environment.
+_OF_CLIENTS = {"VERGENCE_TOKEN", "VERGENCE_TOKEN_FILE", "VERGENCE_CA"}
+
+
 class SettingsError(ValueError):
     """A setting is unknown, or its value is not allowed."""
 
@@ -83,6 +87,30 @@ class ZenohSettings(_Section):
     )
 
 
+class SecuritySettings(_Section):
+    tls_cert: Path | None = Field(
+        default=None, description="PEM file with the certificate for gRPC and HTTP; may be replaced"
+    )
+    tls_key: Path | None = Field(default=None, description="PEM file with its private key")
+    client_ca: Path | None = Field(
+        default=None,
+        description="PEM file of the authority of client certificates; clients then need one",
+    )
+    tokens: Path | None = Field(
+        default=None,
+        description="file of tokens, of `vergence token`; clients then need one; may be changed",
+    )
+    hosts: tuple[str, ...] = Field(
+        default=(), description='names of this server for HTTP without TLS; "*" allows any'
+    )
+    trusted_proxies: tuple[str, ...] = Field(
+        default=(), description="addresses whose X-Forwarded-For is believed"
+    )
+    insecure: bool = Field(
+        default=False, description="listen beyond this machine even without TLS and credentials"
+    )
+
+
 class ModelSettings(_Section):
     name: str = Field(default="lite", description="model of the manifest")
     weights: Path | None = Field(
@@ -123,10 +151,6 @@ class StreamSettings(_Section):
     capacity: PositiveInt = Field(default=16, description="most streams that are open at once")
     credit: PositiveInt = Field(
         default=2, description="most frames that a client may send before an answer returns"
-    )
-    paced_credit: PositiveInt = Field(
-        default=12,
-        description="the same for a live client that paces its frames by the link it measures",
     )
     waiting_frames: PositiveInt = Field(
         default=8, description="frames of a lossless stream that wait before its sender must wait"
@@ -174,6 +198,12 @@ class LimitSettings(_Section):
     )
     pairs: PositiveInt = Field(
         default=8, description="most single pairs that wait or are stepped; one is stepped at once"
+    )
+    streams: PositiveInt = Field(
+        default=4, description="most open streams of one principal; a token may allow others"
+    )
+    waiting_sequences: PositiveInt = Field(
+        default=8, description="most unfinished sequences of one principal"
     )
     streams_per_client: PositiveInt | None = Field(
         default=None, description="most open streams of one address, over gRPC and HTTP"
@@ -253,6 +283,7 @@ class Settings(BaseSettings):
     grpc: GrpcSettings = GrpcSettings()
     http: HttpSettings = HttpSettings()
     zenoh: ZenohSettings = ZenohSettings()
+    security: SecuritySettings = SecuritySettings()
     model: ModelSettings = ModelSettings()
     streams: StreamSettings = StreamSettings()
     limits: LimitSettings = LimitSettings()
@@ -284,7 +315,9 @@ def load_settings(
         (
             name.removeprefix(ENV_PREFIX).lower().replace(_NESTED, ".")
             for name, value in os.environ.items()
-            if name.startswith(ENV_PREFIX) and not _SERVICE_LINK.match(f"{name}={value}")
+            if name.startswith(ENV_PREFIX)
+            and name not in _OF_CLIENTS
+            and not _SERVICE_LINK.match(f"{name}={value}")
         ),
         f"in the environment ({ENV_PREFIX}...)",
     )

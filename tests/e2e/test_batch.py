@@ -57,9 +57,10 @@ async def test_folders_and_archives_come_back_as_disparity(tmp_path: Path) -> No
 
 async def test_what_was_collected_takes_no_room_on_the_server(tmp_path: Path) -> None:
     room = write_sequence(tmp_path / "room", make_frames(2))
-    async with http_server(RecallModel()) as client:
+    jobs = tmp_path / "jobs"
+    async with http_server(RecallModel(), batch__directory=jobs) as client:
         await run([room], str(client.base_url), tmp_path / "out")
-        assert (await client.get("/v1/sequences")).json() == []
+        assert list((jobs / "jobs").iterdir()) == []
 
 
 async def test_one_failure_does_not_stop_the_others_and_is_reported(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import httpx
 import numpy as np
 from rich.console import Console
 
-from tests.support.http import disparities, ended, files_below, http_server, submit
+from tests.support.http import disparities, ended, files_below, http_server, state_of, submit
 from tests.support.models import RecallModel
 from tests.support.polling import eventually
 from tests.support.sequences import make_frames, sequence_files, write_sequence, zip_bytes
@@ -59,7 +59,7 @@ async def test_a_killed_server_finishes_all_that_it_accepted(tmp_path: Path) -> 
     async with killed_server(tmp_path, step_s=0.04) as client:
         job_ids = [(await submit(client, archive))["id"] for archive in ARCHIVES]
         await ended(client, job_ids[2])
-        before = {each["id"]: each["state"] for each in (await client.get("/v1/sequences")).json()}
+        before = {each: await state_of(client, each) for each in job_ids}
     assert "queued" in before.values(), "the kill came too late to show anything"
     (tmp_path / "incoming" / "half").mkdir()
     (tmp_path / "incoming" / "half" / "archive").write_bytes(
@@ -130,10 +130,9 @@ async def test_a_batch_goes_on_when_its_server_is_killed_and_comes_back(tmp_path
             console=Console(file=io.StringIO()),
         )
     )
-    async with killed_server(tmp_path / "jobs", step_s=0.04, port=port) as client:
+    async with killed_server(tmp_path / "jobs", step_s=0.04, port=port) as _:
         async with asyncio.timeout(PATIENCE_S):
-            while not (await client.get("/v1/sequences")).json():  # noqa: ASYNC110  as clients wait
-                await asyncio.sleep(0.01)
+            await eventually(lambda: any((tmp_path / "jobs" / "jobs").iterdir()))
     assert not going.done()
     async with killed_server(tmp_path / "jobs", port=port):
         await asyncio.wait_for(going, PATIENCE_S)

@@ -167,7 +167,9 @@ async def test_closing_a_stream_from_elsewhere_ends_its_call() -> None:
         connected(server) as stub,
         raw_stream(server, "mine") as call,
     ):
-        await stub.CloseStream(pb.CloseStreamRequest(stream_id="mine"))
+        await stub.CloseStream(
+            pb.CloseStreamRequest(stream_id="mine", resume_token=call.opened.resume_token)
+        )
         with pytest.raises(grpc.aio.AioRpcError) as failure:
             await call.receive()
     assert reason_of(failure.value) == "STREAM_UNKNOWN"

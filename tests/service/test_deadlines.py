@@ -17,7 +17,7 @@ import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from tests.support.frames import frame_message, make_frame, open_message
-from tests.support.http import http_to
+from tests.support.http import PROTOBUF, http_to
 from tests.support.http import reason_of as reason_over_http
 from tests.support.models import RecallModel
 from tests.support.polling import eventually, eventually_true
@@ -221,13 +221,18 @@ async def test_a_silent_client_over_http_counts_as_lost() -> None:
         running_server(RecallModel(), clock=clock) as server,
         http_to(server) as http,
         http.stream(
-            "POST", "/v1/streams", content=open_message("mine").SerializeToString()
+            "POST",
+            "/v1/streams",
+            content=open_message("mine").SerializeToString(),
+            headers=PROTOBUF,
         ) as answer,
     ):
         records = answer.aiter_raw()
         await anext(records)
         ping = pb.StreamDepthRequest(ping=pb.Ping()).SerializeToString()
-        await http.post(f"/v1/streams/{answer.headers[CALL_ID_HEADER]}", content=ping)
+        await http.post(
+            f"/v1/streams/{answer.headers[CALL_ID_HEADER]}", content=ping, headers=PROTOBUF
+        )
         await anext(records)
         clock.advance(15)
         server.engine.streams.sweep()
@@ -245,7 +250,10 @@ async def test_a_client_over_http_that_does_not_read_is_disconnected() -> None:
         narrow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         reader, writer = await asyncio.open_connection(sock=narrow)
         body = open_message("slow", rig=StereoRig.from_rectified(LARGE)).SerializeToString()
-        head = f"POST /v1/streams HTTP/1.1\r\nhost: a\r\ncontent-length: {len(body)}\r\n\r\n"
+        head = (
+            "POST /v1/streams HTTP/1.1\r\nhost: [::1]\r\n"
+            f"content-type: {PROTOBUF_TYPE}\r\ncontent-length: {len(body)}\r\n\r\n"
+        )
         writer.write(head.encode() + body)
         response = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), PATIENCE_S)
         [call_id] = [
@@ -257,7 +265,8 @@ async def test_a_client_over_http_that_does_not_read_is_disconnected() -> None:
         while sent == httpx.codes.NO_CONTENT:
             frame_id += 1
             frame = frame_message(make_frame(frame_id, rig=LARGE)).SerializeToString()
-            sent = (await http.post(f"/v1/streams/{call_id}", content=frame)).status_code
+            answer = await http.post(f"/v1/streams/{call_id}", content=frame, headers=PROTOBUF)
+            sent = answer.status_code
         assert sent == httpx.codes.NOT_FOUND
         await eventually(lambda: server.engine.streams.get("slow").attachment is None)
         writer.close()
@@ -265,14 +274,14 @@ async def test_a_client_over_http_that_does_not_read_is_disconnected() -> None:
 
 @pytest.mark.parametrize(
     ("requests_before", "sent"),
-    [(0, b""), (0, b"GET /healthz HTTP/1.1\r\nHost: a\r\nX"), (1, b"GET /heal")],
+    [(0, b""), (0, b"GET /healthz HTTP/1.1\r\nHost: [::1]\r\nX"), (1, b"GET /heal")],
     ids=["nothing", "half-headers", "half-headers-of-the-second-request"],
 )
 async def test_a_request_without_its_headers_is_ended(requests_before: int, sent: bytes) -> None:
     async with running_server(RecallModel(), limits__first_message_s=0.1) as server:
         reader, writer = await asyncio.open_connection(*server.http_address.split(":"))
         for _ in range(requests_before):
-            writer.write(b"GET /healthz HTTP/1.1\r\nHost: a\r\n\r\n")
+            writer.write(b"GET /healthz HTTP/1.1\r\nHost: [::1]\r\n\r\n")
             await asyncio.wait_for(reader.readuntil(b'{"status":"alive"}'), PATIENCE_S)
         writer.write(sent)
         answer = await closed(reader)
@@ -283,11 +292,12 @@ async def test_a_request_without_its_headers_is_ended(requests_before: int, sent
 @pytest.mark.parametrize("path", ["/v1/methods/GetServerInfo", "/v1/streams", "/v1/sequences"])
 async def test_a_body_that_comes_too_slowly_is_refused(path: str) -> None:
     quick: dict[str, Any] = {"limits__first_message_s": 0.1, "batch__idle_s": 0.1}
+    kind = "application/zip" if path == "/v1/sequences" else PROTOBUF_TYPE
     async with running_server(RecallModel(), **quick) as server:
         reader, writer = await asyncio.open_connection(*server.http_address.split(":"))
         writer.write(
-            f"POST {path} HTTP/1.1\r\nHost: a\r\nContent-Length: 100000\r\n"
-            "Content-Type: application/zip\r\n\r\n".encode()
+            f"POST {path} HTTP/1.1\r\nHost: [::1]\r\nContent-Length: 100000\r\n"
+            f"Content-Type: {kind}\r\n\r\n".encode()
         )
         reading = asyncio.create_task(reader.readuntil(b"\r\n\r\n"))
         while not reading.done():
@@ -347,10 +357,11 @@ async def test_connections_beyond_the_limit_are_refused_and_the_others_served() 
 async def test_close_stream_returns_when_the_streams_own_connection_has_ended() -> None:
     async with (
         running_server(RecallModel(), streams__capacity=1) as server,
-        raw_stream(server, "mine"),
+        raw_stream(server, "mine") as call,
         connected(server) as stub,
     ):
-        await stub.CloseStream(pb.CloseStreamRequest(stream_id="mine"))
+        token = call.opened.resume_token
+        await stub.CloseStream(pb.CloseStreamRequest(stream_id="mine", resume_token=token))
         async with raw_stream(server, "next"):  # its place is free at once
             pass
 

@@ -117,7 +117,9 @@ async def test_a_second_server_on_a_port_fails_and_says_so(transport: str) -> No
 
 async def test_an_address_of_another_machine_is_distinguished_from_a_port_that_is_taken() -> None:
     with pytest.raises(PortTaken, match="choose another address with --host"):
-        await running_server(RecallModel(), server__host="203.0.113.1").__aenter__()
+        await running_server(
+            RecallModel(), server__host="203.0.113.1", security__insecure=True
+        ).__aenter__()
 
 
 @contextmanager

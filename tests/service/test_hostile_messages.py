@@ -8,6 +8,7 @@ import pytest
 from grpc_health.v1 import health_pb2
 
 from tests.support.frames import frame_message, make_frame
+from tests.support.http import PROTOBUF
 from tests.support.models import RecallModel
 from tests.support.server import raw_stream, running_server
 
@@ -79,6 +80,8 @@ async def test_over_grpc_a_bomb_ends_its_call_in_words(
 )
 async def test_over_http_a_bomb_is_refused(path: str, body: bytes, status: int) -> None:
     async with running_server(RecallModel()) as server, httpx.AsyncClient() as client:
-        answer = await client.post(f"http://{server.http_address}{path}", content=body)
+        answer = await client.post(
+            f"http://{server.http_address}{path}", content=body, headers=PROTOBUF
+        )
         assert answer.status_code == status
         assert "expected" in answer.json()["detail"]

@@ -175,7 +175,7 @@ async def test_an_upload_that_breaks_off_or_stalls_leaves_nothing_behind(tmp_pat
         for breaks_off in (True, False):
             reader, writer = await asyncio.open_connection(host, int(port))
             writer.write(
-                b"POST /v1/sequences HTTP/1.1\r\nHost: here\r\nContent-Type: application/zip\r\n"
+                b"POST /v1/sequences HTTP/1.1\r\nHost: [::1]\r\nContent-Type: application/zip\r\n"
                 b"Connection: close\r\nContent-Length: 1000000\r\n\r\nPK\x03\x04"
             )
             await writer.drain()

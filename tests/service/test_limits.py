@@ -9,6 +9,7 @@ import pytest
 from google.rpc import error_details_pb2
 
 from tests.support.frames import RIG, frame_message, make_frame, open_message
+from tests.support.http import PROTOBUF
 from tests.support.models import RecallModel
 from tests.support.server import RawCall, connected, raw_stream, running_server
 from tests.support.status import reason_of, unpack_detail
@@ -61,7 +62,7 @@ async def test_a_client_that_has_its_share_is_refused_and_leaves_room_to_others(
         async with httpx.AsyncClient(transport=elsewhere) as other:
             url = f"http://{server.http_address}/v1/streams"
             body = open_message("theirs").SerializeToString()
-            async with other.stream("POST", url, content=body) as answer:
+            async with other.stream("POST", url, content=body, headers=PROTOBUF) as answer:
                 assert answer.status_code == 200
                 assert server.engine.streams.get("theirs").client == "127.0.0.2"
 

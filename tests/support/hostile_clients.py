@@ -18,6 +18,7 @@ import numpy as np
 
 from tests.support import hostile_inputs
 from tests.support.frames import frame_message, make_frame, open_message
+from tests.support.http import PROTOBUF
 from vergence_proto import codec
 from vergence_proto.geometry import Pose, RectifiedRig
 from vergence_proto.http_records import CALL_ID_HEADER
@@ -149,18 +150,20 @@ class HttpAttacker:
         self._frame_ids[index] += 1
         data = hostile_inputs.frame(chance, self._frame_ids[index])
         path = f"/v1/streams/{self._calls[index][0]}"
-        if await self._post(path, content=data) != httpx.codes.NO_CONTENT:
+        if await self._post(path, content=data, headers=PROTOBUF) != httpx.codes.NO_CONTENT:
             await self._leave(index)
 
     async def opening(self, data: bytes) -> None:
         with suppress(httpx.HTTPError):
-            async with self._client.stream("POST", f"{self._url}/v1/streams", content=data) as got:
+            async with self._client.stream(
+                "POST", f"{self._url}/v1/streams", content=data, headers=PROTOBUF
+            ) as got:
                 self._seen[f"http: {got.status_code}"] += 1
 
     async def method(self, chance: random.Random) -> None:
         name = chance.choice(("GetServerInfo", "GetStream", "CloseStream", "x" * 200))
         data = hostile_inputs.message_of_any_kind(chance)
-        await self._post(f"/v1/methods/{name}", content=data)
+        await self._post(f"/v1/methods/{name}", content=data, headers=PROTOBUF)
 
     async def pair(self, files: dict[str, bytes]) -> None:
         await self._post("/v1/pairs", files=files)
@@ -180,7 +183,9 @@ class HttpAttacker:
         data = open_message(every=False).SerializeToString()
         try:
             answer = await stack.enter_async_context(
-                self._client.stream("POST", f"{self._url}/v1/streams", content=data)
+                self._client.stream(
+                    "POST", f"{self._url}/v1/streams", content=data, headers=PROTOBUF
+                )
             )
         except httpx.HTTPError:
             return

@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 
 from tests.support.polling import eventually_true
 from tests.support.server import PATIENCE_S, running_server
+from vergence_proto.http_records import PROTOBUF_TYPE
 from vergence_proto.jobs import JobState
 from vergence_service.app.server import Running
 from vergence_service.inference.model import StereoModel
 
 ZIP = {"Content-Type": "application/zip"}
+PROTOBUF = {"Content-Type": PROTOBUF_TYPE}
 
 
 @asynccontextmanager
@@ -51,6 +53,14 @@ async def ended(client: httpx.AsyncClient, job_id: str) -> dict[str, Any]:
 
     await eventually_true(has_ended)
     return job
+
+
+async def state_of(client: httpx.AsyncClient, job_id: str) -> str:
+    return str((await client.get(f"/v1/sequences/{job_id}")).json()["state"])
+
+
+async def is_known(client: httpx.AsyncClient, job_id: str) -> bool:
+    return (await client.get(f"/v1/sequences/{job_id}")).status_code == httpx.codes.OK
 
 
 async def disparities(client: httpx.AsyncClient, job_id: str) -> list[NDArray[np.float32]]:

@@ -40,7 +40,7 @@ _OWN = (("grpc.use_local_subchannel_pool", 1),)
 _PATIENCE_S = 20.0
 _EOF = grpc.aio.EOF  # type: ignore[attr-defined] # its stubs leave it out
 _JUNK = (b"", b"GET /", b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n", b"\x16\x03\x01\x02\x00", b"\0" * 64)
-_POST = b"POST /v1/sequences HTTP/1.1\r\nHost: a\r\nContent-Length: 100000\r\n"
+_POST = b"POST /v1/sequences HTTP/1.1\r\nHost: [::1]\r\nContent-Length: 100000\r\n"
 _IN_TIME = (grpc.aio.AioRpcError, asyncio.InvalidStateError, TimeoutError, OSError, DepthError)
 
 

@@ -13,6 +13,7 @@ import typer
 
 from vergence.cli.errors import CliError
 from vergence.transports.addresses import DEFAULT_SERVER, connector
+from vergence.transports.credentials import use_files
 from vergence_proto.errors import DepthError
 from vergence_proto.jobs import MAP_FORMATS, JobOutput, OnError, Output, ResultFormat
 
@@ -79,7 +80,26 @@ def _vergence(
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show it.")
     ] = False,
-) -> None: ...
+    token_file: Annotated[
+        Path | None,
+        typer.Option(
+            help="File with the token for the server; also VERGENCE_TOKEN_FILE, or VERGENCE_TOKEN "
+            "with the token itself.",
+            exists=True,
+            dir_okay=False,
+        ),
+    ] = None,
+    ca: Annotated[
+        Path | None,
+        typer.Option(
+            help="PEM file of the authority that signed the server's certificate; also "
+            "VERGENCE_CA.",
+            exists=True,
+            dir_okay=False,
+        ),
+    ] = None,
+) -> None:
+    use_files(token_file=token_file, ca=ca)
 
 
 @app.command("demo")

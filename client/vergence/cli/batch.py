@@ -21,6 +21,8 @@ from vergence.cli.progress import progress_bar
 from vergence.cli.result_folder import make_room
 from vergence.cli.sequence_jobs import Job, Query, SequenceService
 from vergence.cli.uploads import Upload, find_uploads
+from vergence.transports.addresses import is_private
+from vergence.transports.credentials import Credentials
 from vergence.transports.http import http_client
 from vergence_proto.errors import DepthError
 from vergence_proto.jobs import JobState, ResultFormat
@@ -90,8 +92,11 @@ async def _send(
     started_s = time.monotonic()
     # Only connecting is bounded: the length of an upload is not known.
     timeout = httpx.Timeout(None, connect=_CONNECT_S)
+    shown = Credentials.of(None, None, None, None, private=is_private(address))
     with progress_bar(console) as progress, tempfile.TemporaryDirectory() as scratch:
-        async with http_client(address, timeout=timeout) as http:
+        async with http_client(
+            address, timeout=timeout, headers=dict(shown.headers), verify=shown.tls()
+        ) as http:
             service = SequenceService(http)
             places = asyncio.Semaphore(_AT_ONCE)
 

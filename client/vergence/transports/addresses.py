@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import parse_qs, urlsplit
 
+from vergence.transports.credentials import Credentials
 from vergence_proto.extras import how_to_install
 from vergence_proto.zenoh.keys import DEFAULT_NAMESPACE
 
@@ -17,27 +18,46 @@ DEFAULT_SERVER = "grpc://127.0.0.1:50051"
 """The address of a server on this machine with its default port."""
 
 _EXPECTED = (
-    "expected a server as grpc://HOST:PORT, http://HOST:PORT or "
+    "expected a server as grpc://HOST:PORT or http://HOST:PORT (grpcs, https: encrypted) or "
     "zenoh://HOST:PORT[/NAMESPACE][?config=FILE], got {!r}"
 )
 
 
-def connector(server: str) -> "Callable[[], Transport]":
+def connector(
+    server: str,
+    *,
+    token: str | None = None,
+    ca: str | Path | None = None,
+    cert: str | Path | None = None,
+    key: str | Path | None = None,
+) -> "Callable[[], Transport]":
     """Return a function that makes the transport; call it in the event loop that will use it.
 
     ``zenoh+tls://`` and the like name the link, which is TCP by default. Raises ValueError.
     """
+    credentials = Credentials.of(token, ca, cert, key, private=is_private(server))
     scheme, separator, address = server.rpartition("://")
-    if scheme == ("grpc" if separator else "") and _is_place(address):
+    if scheme in (("grpc", "grpcs") if separator else ("",)) and _is_place(address):
         from vergence.transports.grpc import GrpcTransport
 
-        return partial(GrpcTransport, address, direct=on_this_machine(server))
+        return partial(
+            GrpcTransport,
+            address,
+            direct=on_this_machine(server),
+            secure=scheme == "grpcs",
+            credentials=credentials,
+        )
     if scheme in ("http", "https") and _is_place(address):
-        return _http_connector(server)
+        return _http_connector(server, credentials)
     kind, _, link = scheme.partition("+")
     if kind == "zenoh":
         return _zenoh_connector(server, link or "tcp")
     raise ValueError(_EXPECTED.format(server))
+
+
+def is_private(server: str) -> bool:
+    """Return True if nobody on the way to ``server`` can read what is sent."""
+    return server.partition("://")[0] in ("grpcs", "https") or on_this_machine(server)
 
 
 def on_this_machine(server: str) -> bool:
@@ -47,7 +67,7 @@ def on_this_machine(server: str) -> bool:
     """
     scheme, _, address = server.rpartition("://")
     host = (urlsplit(f"//{address}").hostname or "").removesuffix(".")
-    if scheme not in ("", "grpc", "http", "https"):
+    if scheme not in ("", "grpc", "grpcs", "http", "https"):
         return False
     try:
         ip = ipaddress.ip_address(host)
@@ -77,14 +97,14 @@ def _zenoh_connector(server: str, link: str) -> "Callable[[], Transport]":
     )
 
 
-def _http_connector(server: str) -> "Callable[[], Transport]":
+def _http_connector(server: str, credentials: Credentials) -> "Callable[[], Transport]":
     try:
         from vergence.transports.http import HttpTransport
     except ImportError:
         raise ValueError(
             f"{server} needs httpx, which is not installed here: {how_to_install('cli')}"
         ) from None
-    return partial(HttpTransport, server)
+    return partial(HttpTransport, server, credentials=credentials)
 
 
 def _is_place(address: str) -> bool:

@@ -10,6 +10,7 @@ from google.protobuf.message import Message
 from grpc_status import rpc_status
 
 from vergence.transports.base import Answer, Call, ClientClosed, ConnectionLost
+from vergence.transports.credentials import Credentials
 from vergence.transports.forks import use_grpc
 from vergence.transports.proxies import through_proxy
 from vergence_proto import codec
@@ -42,14 +43,24 @@ _CHANNEL_OPTIONS = (
 
 
 class GrpcTransport:
-    """The :class:`~vergence.transports.base.Transport` to one ``host:port``, in the clear.
+    """The :class:`~vergence.transports.base.Transport` to one ``host:port``.
 
-    ``direct``: without the web proxy that the environment may name.
+    ``direct``: without the web proxy that the environment may name. ``secure``: over TLS.
     Raises ConnectionLost: the process was forked after gRPC was used.
     """
 
-    def __init__(self, address: str, *, direct: bool = False) -> None:
+    def __init__(
+        self,
+        address: str,
+        *,
+        direct: bool = False,
+        secure: bool = False,
+        credentials: Credentials | None = None,
+    ) -> None:
         use_grpc()
+        shown = credentials or Credentials()
+        self._metadata = tuple(shown.headers.items())
+        self._tls = _tls_of(shown) if secure else None
         self._address = address
         self._options = (*_CHANNEL_OPTIONS, ("grpc.enable_http_proxy", int(not direct)))
         self._through = "" if direct else through_proxy(f"grpc://{address}")
@@ -67,7 +78,9 @@ class GrpcTransport:
             request_serializer=bytes,  # requests are serialized already
             response_deserializer=pb.StreamDepthResponse.FromString,
         )
-        started = start(request_iterator=None, metadata=((STREAM_ID_METADATA, stream_id),))
+        started = start(
+            request_iterator=None, metadata=((STREAM_ID_METADATA, stream_id), *self._metadata)
+        )
         call = _GrpcCall(channel, started, self._address, self._through)
         try:
             await call.connected()
@@ -79,7 +92,9 @@ class GrpcTransport:
         return call
 
     def _connection(self) -> grpc.aio.Channel:
-        return grpc.aio.insecure_channel(self._address, options=self._options)
+        if self._tls is None:
+            return grpc.aio.insecure_channel(self._address, options=self._options)
+        return grpc.aio.secure_channel(self._address, self._tls, options=self._options)
 
     async def ask(self, method: str, request: Message, answer: type[Answer]) -> Answer:
         invoke = self._channel.unary_unary(
@@ -88,7 +103,9 @@ class GrpcTransport:
             response_deserializer=answer.FromString,
         )
         try:
-            response: Answer = await invoke(request, timeout=_ASK_TIMEOUT_S)
+            response: Answer = await invoke(
+                request, timeout=_ASK_TIMEOUT_S, metadata=self._metadata
+            )
         except grpc.aio.AioRpcError as error:
             raise _error_from_rpc(error, self._address, self._through) from None
         return response
@@ -98,6 +115,14 @@ class GrpcTransport:
         await self._channel.close(grace=None)
         for call in list(self._calls):
             await call.close()
+
+
+def _tls_of(credentials: Credentials) -> grpc.ChannelCredentials:
+    ca, key, cert = (
+        None if file is None else file.read_bytes()
+        for file in (credentials.ca, credentials.key, credentials.cert)
+    )
+    return grpc.ssl_channel_credentials(ca, key, cert)
 
 
 class _GrpcCall:

@@ -9,6 +9,7 @@ from google.protobuf.message import Message
 
 from vergence.transports.addresses import on_this_machine
 from vergence.transports.base import Answer, Call, ClientClosed, ConnectionLost
+from vergence.transports.credentials import Credentials
 from vergence.transports.proxies import through_proxy
 from vergence_proto import codec
 from vergence_proto.errors import DepthError, NotReady, error_from_wire
@@ -40,9 +41,11 @@ def http_client(server: str, **options: Any) -> httpx.AsyncClient:
 class HttpTransport:
     """The :class:`~vergence.transports.base.Transport` to ``http://HOST:PORT`` (or https)."""
 
-    def __init__(self, base_url: str) -> None:
+    def __init__(self, base_url: str, *, credentials: Credentials | None = None) -> None:
         self._base_url = base_url
-        self._tls = httpx.create_ssl_context()  # one for all connections: it takes 20 ms to make
+        shown = credentials or Credentials()
+        self._shown = dict(shown.headers)
+        self._tls = shown.tls()  # one for all connections: it takes 20 ms to make
         self._http = self._connections()
         self._calls: set[_HttpCall] = set()
 
@@ -60,7 +63,9 @@ class HttpTransport:
         return call
 
     def _connections(self) -> httpx.AsyncClient:
-        return http_client(self._base_url, timeout=_TIMEOUT_S, verify=self._tls)
+        return http_client(
+            self._base_url, timeout=_TIMEOUT_S, verify=self._tls, headers=self._shown
+        )
 
     async def ask(self, method: str, request: Message, answer: type[Answer]) -> Answer:
         self._check_open()

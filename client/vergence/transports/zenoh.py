@@ -46,8 +46,9 @@ class ZenohTransport:
         self._calls = {each.stream_id: each for each in self._calls.values() if not each.over}
         before = self._calls.get(stream_id)
 
-        async def find(resumes: bool) -> ServerInfos:
-            return await self._servers_for(peer, stream_id, before if resumes else None)
+        async def find(resume_token: bytes) -> ServerInfos:
+            question = pb.GetStreamRequest(stream_id=stream_id, resume_token=resume_token)
+            return await self._servers_for(peer, question, before if resume_token else None)
 
         call = ZenohCall(peer, self._namespace, stream_id, find, before)
         if self._closed:
@@ -95,7 +96,7 @@ class ZenohTransport:
         return ConnectionLost(f"no connection to {self._endpoint}: {reason_of(error)}")
 
     async def _servers_for(
-        self, peer: ZenohSession, stream_id: str, before: ZenohCall | None
+        self, peer: ZenohSession, question: pb.GetStreamRequest, before: ZenohCall | None
     ) -> ServerInfos:
         """Return the servers for a stream, best first: the one that has it, else by load.
 
@@ -103,7 +104,6 @@ class ZenohTransport:
         or not yet the one of ``before``.
         """
         home = before.server_id if before else ""
-        question = pb.GetStreamRequest(stream_id=stream_id)
         # Both at once: a server that hangs costs the whole timeout, and opening has a timeout too.
         infos, holders = await asyncio.gather(
             self._ask_all(
@@ -113,7 +113,9 @@ class ZenohTransport:
         )
         lost_for_s = time.monotonic() - (before.lost_s or 0.0) if before else math.inf
         if home not in infos and lost_for_s < _HOME_PATIENCE_S:
-            raise ConnectionLost(f"the server of stream {stream_id!r} is not on the network")
+            raise ConnectionLost(
+                f"the server of stream {question.stream_id!r} is not on the network"
+            )
         known = [each for each in holders if each in infos] or [home] * (home in infos)
         ids = known or sorted(infos, key=lambda each: _load(infos[each]))
         return {each: infos[each] for each in ids}

@@ -48,7 +48,7 @@ class ZenohCall:
         peer: ZenohSession,
         namespace: str,
         stream_id: str,
-        find_servers: Callable[[bool], Awaitable[ServerInfos]],
+        find_servers: Callable[[bytes], Awaitable[ServerInfos]],
         before: "ZenohCall | None",
     ) -> None:
         self.stream_id: str = stream_id
@@ -129,7 +129,7 @@ class ZenohCall:
 
     async def _open(self, opening: pb.OpenStream) -> None:
         self._live = opening.delivery != pb.DELIVERY_EVERY
-        servers = await self._find_servers(bool(opening.resume_token))
+        servers = await self._find_servers(opening.resume_token)
         peer, declared = self._peer, self._declared
         declared.append(await peer.subscribe(self._keys.disparity, self._inbox.put))
         declared.append(await peer.subscribe(self._keys.status, self._inbox.put))

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from vergence_proto.model_io import ManifestError
+from vergence_service.app.security import check_exposure
 from vergence_service.app.server import Running, serve
 from vergence_service.descriptors import raise_descriptor_limit
 from vergence_service.inference.providers import ProviderUnavailable
@@ -48,6 +49,8 @@ def run_server(
         if print_config:
             sys.stdout.write(settings.to_toml())
             return
+        os.umask(0o077)  # what clients send is for nobody else on this machine
+        check_exposure(settings)
         start_logging(settings.log_level)
         save_address_space()
         keep_freed_memory()

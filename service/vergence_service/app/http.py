@@ -12,6 +12,8 @@ from tempfile import TemporaryDirectory
 
 from prometheus_client import CollectorRegistry
 
+from vergence_service.access.gate import Gate
+from vergence_service.app.security import host_names
 from vergence_service.jobs.archives import ArchiveLimits
 from vergence_service.jobs.places import Places
 from vergence_service.jobs.queue import JobQueue, QueueLimits
@@ -20,12 +22,14 @@ from vergence_service.settings import Settings
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.transports.addresses import listening_socket
 from vergence_service.transports.http.app import HttpServer, make_http_app
+from vergence_service.transports.http.border import Border
 from vergence_service.transports.http.connections import ConnectionLimits
 from vergence_service.transports.http.pairs import pair_routes
 from vergence_service.transports.http.sequences import no_sequence_routes, sequence_routes
 from vergence_service.transports.http.streams import stream_routes
 from vergence_service.transports.http.uploads import UploadLimits
 from vergence_service.transports.open_calls import OpenCalls
+from vergence_service.transports.tls import Certificate
 from vergence_service.transports.unary import UnaryMethods
 
 log = logging.getLogger(__name__)
@@ -53,6 +57,8 @@ async def serving_http(
     registry: CollectorRegistry,
     *,
     connections: int,
+    gate: Gate,
+    certificate: Certificate | None,
 ) -> AsyncIterator[HttpTransport]:
     """Serve HTTP until the end of the block.
 
@@ -111,6 +117,7 @@ async def serving_http(
                     limits=QueueLimits(
                         waiting=batch.waiting,
                         waiting_per_client=batch.waiting_per_client,
+                        waiting_per_principal=settings.limits.waiting_sequences,
                         checkpoint_s=batch.checkpoint_s,
                         keep_s=batch.keep_h * 3600,
                         disk_bytes=batch.disk_mib * _MIB,
@@ -128,7 +135,7 @@ async def serving_http(
         )
         server = await stack.enter_async_context(
             HttpServer(
-                app,
+                Border(app, gate=gate, hosts=host_names(settings)),
                 calls,
                 listening=listening,
                 limits=ConnectionLimits(
@@ -138,6 +145,8 @@ async def serving_http(
                     min_bytes_per_s=min_bytes_per_s,
                 ),
                 stopping=stopping,
+                certificate=certificate,
+                trusted_proxies=settings.security.trusted_proxies,
             )
         )
         yield HttpTransport(server, queue)

@@ -12,6 +12,12 @@ from prometheus_client import CollectorRegistry
 from vergence_proto.stopping import STOP_SIGNALS, on_end_of_input, on_signals
 from vergence_proto.types import Delivery
 from vergence_service.app.http import serving_http
+from vergence_service.app.security import (
+    check_exposure,
+    keep_current,
+    make_certificate,
+    make_gate,
+)
 from vergence_service.app.zenoh import ZenohTransport, serving_zenoh
 from vergence_service.descriptors import affordable_connections
 from vergence_service.inference.batcher import StepBatcher
@@ -76,10 +82,13 @@ async def running(
 ) -> AsyncIterator[Running]:
     """Run a server; it serves until the end of the block.
 
-    Raises PortTaken if a port is in use, ExtraMissing if Zenoh is not installed, ZenohUnreachable
+    Raises SettingsError if strangers could reach it or its tokens or certificate cannot be read,
+    PortTaken if a port is in use, ExtraMissing if Zenoh is not installed, ZenohUnreachable
     if its network cannot be joined, and ManifestError or ProviderUnavailable if the model cannot
     be loaded.
     """
+    check_exposure(settings)
+    gate, certificate = make_gate(settings), make_certificate(settings)
     registry = CollectorRegistry()
     metrics = Metrics(registry)
     memory = MemoryBudget(settings.limits.max_state_mib * _MIB, metrics=metrics)
@@ -89,6 +98,7 @@ async def running(
     streams = StreamTable(
         capacity=settings.streams.capacity,
         per_client=settings.limits.streams_per_client,
+        per_principal=settings.limits.streams,
         memory=memory,
         idle_timeout_s=settings.streams.idle_timeout_s,
         idle_notice_s=settings.streams.idle_notice_s,
@@ -96,7 +106,7 @@ async def running(
         silent_s=settings.limits.silent_s,
         clock=clock,
         metrics=metrics,
-        on_closed=lambda stream: batcher.forget(stream.stream_id),
+        on_closed=lambda stream: batcher.forget(stream.key),
     )
     threads = Threads(lanes=model.max_concurrent_steps)
     engine = DepthEngine(
@@ -121,7 +131,6 @@ async def running(
     max_frame_bytes = settings.limits.max_frame_mib * _MIB
     limits = StreamLimits(
         credit=settings.streams.credit,
-        paced_credit=max(settings.streams.paced_credit, settings.streams.credit),
         waiting_frames=settings.streams.waiting_frames,
         max_frame_bytes=max_frame_bytes,
         silent_s=settings.limits.silent_s,
@@ -152,12 +161,23 @@ async def running(
             max_frame_bytes=max_frame_bytes,
             max_connections=connections,
             first_message_s=settings.limits.first_message_s,
+            gate=gate,
+            certificate=certificate,
         ) as grpc_server,
         serving_http(
-            settings, http_host, engine, unary, open_calls(), registry, connections=connections
+            settings,
+            http_host,
+            engine,
+            unary,
+            open_calls(),
+            registry,
+            connections=connections,
+            gate=gate,
+            certificate=certificate,
         ) as http,
-        serving_zenoh(settings, unary, open_calls()) as zenoh,
+        serving_zenoh(settings, unary, open_calls(), gate) as zenoh,
         _in_background(_sweep(streams)),
+        _in_background(keep_current(gate, certificate, engine)),
     ):
         await engine.start()
         memory.reduce_to(affordable_bytes(settings.limits.max_state_mib * _MIB))

@@ -5,6 +5,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from vergence_service.access.gate import Gate
 from vergence_service.settings import Settings
 from vergence_service.transports.addresses import format_address
 from vergence_service.transports.errors import ExtraMissing
@@ -27,7 +28,7 @@ class ZenohTransport:
 
 @asynccontextmanager
 async def serving_zenoh(
-    settings: Settings, unary: UnaryMethods, calls: OpenCalls
+    settings: Settings, unary: UnaryMethods, calls: OpenCalls, gate: Gate
 ) -> AsyncIterator[ZenohTransport | None]:
     """Serve over Zenoh until the end of the block, or yield None if it is not enabled.
 
@@ -55,5 +56,7 @@ async def serving_zenoh(
         max_frame_bytes=calls.limits.max_frame_bytes,
     )
     endpoint = str(chosen.config or ",".join(listen or chosen.connect))
-    async with ZenohServer(unary, calls, config=config, namespace=chosen.namespace) as server:
+    async with ZenohServer(
+        unary, calls, gate=gate, config=config, namespace=chosen.namespace
+    ) as server:
         yield ZenohTransport(server, endpoint)

@@ -37,6 +37,7 @@ class Job:
     source_fps: float | None
     created_s: float  # Unix time, which stays valid after a restart
     client: str = ""  # address of the client that submitted it
+    owner: str = ""  # principal that submitted it; empty: one of an older server
     name: str = ""  # the client's own name for it
     labels: Mapping[str, str] = field(default_factory=dict)  # the client's own
     options: JobOptions = field(default_factory=JobOptions)

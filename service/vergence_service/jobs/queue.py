@@ -11,6 +11,7 @@ from typing import Self
 
 from vergence_proto.errors import BadSequence, InsufficientStorage, QueueFull, Quota
 from vergence_proto.jobs import OnError
+from vergence_service.access.principals import LOCAL, Principal
 from vergence_service.jobs.forecast import forecast
 from vergence_service.jobs.job import Job, JobOptions
 from vergence_service.jobs.progress import JobStatus
@@ -33,6 +34,7 @@ class QueueLimits:
 
     waiting: int  # most unfinished jobs, the running ones included
     waiting_per_client: int | None  # most unfinished jobs of one address
+    waiting_per_principal: int  # most of one principal that has shown a credential
     checkpoint_s: float  # seconds of work that a crash may cost
     keep_s: float  # time that ended jobs are kept
     disk_bytes: int  # disk space
@@ -67,7 +69,8 @@ class JobQueue:
         self._store = store
         self._limits = limits
         self._worker = JobWorker(engine, self.jobs, checkpoint_s=limits.checkpoint_s)
-        self._accepting: list[str] = []  # the clients of the jobs that are being added
+        # Owner and client of the jobs that are being added.
+        self._accepting: list[tuple[str, str]] = []
 
     async def __aenter__(self) -> Self:
         await self.jobs.load()
@@ -85,16 +88,18 @@ class JobQueue:
         await self._worker.stop()
 
     @asynccontextmanager
-    async def upload_folder(self, client: str, *, upload_bytes: int) -> AsyncIterator[Path]:
+    async def upload_folder(
+        self, client: str, *, upload_bytes: int, owner: Principal = LOCAL
+    ) -> AsyncIterator[Path]:
         """Provide a folder for an upload of ``upload_bytes``; 0 if the size is not known.
 
         The folder is removed at the end of the block, unless :meth:`accept` has taken it.
-        ``client`` is the address that the upload comes from.
+        ``client`` is the address that the upload comes from, ``owner`` its sender.
 
         Raises QueueFull, Quota and InsufficientStorage if :meth:`accept` would now. An upload takes
         a place in the queue only when it is complete: a slow one keeps nobody out.
         """
-        self._check_room(client)
+        self._check_room(client, owner)
         await self.jobs.check_free(upload_bytes, what="the upload")
         folder = await self.threads.run(self._store.new_folder)
         try:
@@ -102,16 +107,23 @@ class JobQueue:
         finally:
             await self.threads.run(remove_folder, folder)
 
-    def _check_room(self, client: str) -> None:
+    def _check_room(self, client: str, owner: Principal) -> None:
         limits = self._limits
-        waiting = [*(job.client for job in self.jobs.unfinished()), *self._accepting]
+        waiting = [(job.owner, job.client) for job in self.jobs.unfinished()] + self._accepting
         if len(waiting) >= limits.waiting:
             raise QueueFull(
                 f"{limits.waiting} sequences are waiting, the limit of the queue; try again later "
                 "(the server's setting batch.waiting)",
                 retry_after_s=self.jobs.usual_job_s(),
             )
-        theirs = waiting.count(client)
+        theirs = sum(each == owner.name for each, _ in waiting)
+        if owner.proven and theirs >= limits.waiting_per_principal:
+            raise Quota(
+                f"{theirs} sequences of {owner.name} are waiting, the limit of one principal; try "
+                "again later (the server's setting limits.waiting_sequences)",
+                retry_after_s=self.jobs.usual_job_s(),
+            )
+        theirs = sum(each == client for _, each in waiting)
         if limits.waiting_per_client is not None and theirs >= limits.waiting_per_client:
             raise Quota(
                 f"{theirs} sequences of {client} are waiting, the limit per client; try again "
@@ -120,7 +132,13 @@ class JobQueue:
             )
 
     async def accept(
-        self, folder: Path, order: JobOrder, *, upload_sha256: str, client: str
+        self,
+        folder: Path,
+        order: JobOrder,
+        *,
+        upload_sha256: str,
+        client: str,
+        owner: Principal = LOCAL,
     ) -> JobStatus:
         """Accept the sequence below ``folder``/input. A crash does not lose an accepted job.
 
@@ -147,12 +165,13 @@ class JobQueue:
         uploaded = await self.threads.run(folder_bytes, folder)
         result = result_bytes(sequence, options.outputs)
         job = Job(
-            job_id=secrets.token_hex(8),
+            job_id=secrets.token_hex(16),  # without a credential, it is all that protects a job
             source=chosen,
             frames=len(sequence),
             source_fps=sequence.fps,
             created_s=time.time(),
             client=client,
+            owner=owner.name,
             name=order.name,
             labels=order.labels,
             options=options,
@@ -163,13 +182,13 @@ class JobQueue:
             disk_bytes=uploaded + result,
             result_bytes=result,
         )
-        self._check_room(client)
-        self._accepting.append(client)
+        self._check_room(client, owner)
+        self._accepting.append((owner.name, client))
         try:
             await self._check_disk(job)
             await self.jobs.add(folder, job)
         finally:
-            self._accepting.remove(client)
+            self._accepting.remove((owner.name, client))
         return self.jobs.status(job.job_id)
 
     async def _check_disk(self, job: Job) -> None:

@@ -15,6 +15,7 @@ from vergence_proto.errors import (
     UploadTooLarge,
 )
 from vergence_proto.jobs import JobState
+from vergence_service.access.principals import Principal
 from vergence_service.jobs.job import Job
 from vergence_service.jobs.progress import JobProgress, JobStatus, work_until
 from vergence_service.jobs.results import has_frames
@@ -72,11 +73,20 @@ class JobRegistry:
     def get(self, job_id: str) -> Job:
         """Return a job. Raises UnknownSequence."""
         if job_id not in self._jobs:
-            raise UnknownSequence(
-                f"no sequence {job_id[:64]!r}: it never existed, was deleted, or its result "
-                f"expired, {self._keep_s / 3600:g} h after its end"
-            )
+            raise self._unknown(job_id)
         return self._jobs[job_id]
+
+    def _unknown(self, job_id: str) -> UnknownSequence:
+        return UnknownSequence(
+            f"no sequence {job_id[:64]!r}: it never existed, was deleted, or its result "
+            f"expired, {self._keep_s / 3600:g} h after its end"
+        )
+
+    def check_owner(self, job_id: str, caller: Principal) -> None:
+        """Raise UnknownSequence unless the job exists and ``caller`` may use it."""
+        job = self.get(job_id)
+        if not (caller.owns(job.owner) or (not caller.proven and not job.owner)):
+            raise self._unknown(job_id)
 
     def unfinished(self) -> list[Job]:
         """Return the jobs that wait or run, oldest first."""
@@ -130,9 +140,16 @@ class JobRegistry:
         """Return the Unix time until which the result of an ended job is kept, at least."""
         return None if job.finished_s is None else job.finished_s + self._keep_s
 
-    def statuses(self) -> list[JobStatus]:
-        """Return all jobs with their progress, oldest first."""
-        return [self.status(job_id) for job_id in self._jobs]
+    def statuses(self, caller: Principal) -> list[JobStatus]:
+        """Return the caller's jobs with their progress, oldest first; all for an administrator.
+
+        Callers without a credential share a name, so they see none: the id of a job is its secret.
+        """
+        return [
+            self.status(job_id)
+            for job_id, job in self._jobs.items()
+            if caller.proven and caller.owns(job.owner)
+        ]
 
     def result(self, job_id: str) -> tuple[Job, Path]:
         """Return a job that has ended with any result, and the folder of its result.

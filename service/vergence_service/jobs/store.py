@@ -58,6 +58,9 @@ class JobStore:
         try:
             for name in ("incoming", "jobs"):
                 (self._directory / name).mkdir(parents=True, exist_ok=True)
+            for folder in (self._directory, self._directory / "incoming", self._directory / "jobs"):
+                with suppress(PermissionError):  # a volume of another owner
+                    folder.chmod(0o700)  # uploads are pictures of homes
             self._database = sqlite3.connect(
                 self._directory / "jobs.sqlite3",
                 timeout=0,
@@ -74,6 +77,8 @@ class JobStore:
             # An accepted job survives a power cut.
             self._database.execute("PRAGMA synchronous = FULL")
             self._database.execute(_JOBS)
+            with suppress(PermissionError):
+                (self._directory / "jobs.sqlite3").chmod(0o600)
             self._database.execute(_UPTIME)
             row = self._database.execute("SELECT seconds FROM uptime").fetchone()
             if row is None:

@@ -11,6 +11,7 @@ from vergence_proto.errors import (
     ModelChanged,
     NonFinite,
     NotReady,
+    Unauthenticated,
     UnknownStream,
 )
 from vergence_proto.types import (
@@ -21,6 +22,7 @@ from vergence_proto.types import (
     StereoRig,
     Timings,
 )
+from vergence_service.access.principals import LOCAL, Principal
 from vergence_service.failures import out_of_memory
 from vergence_service.inference.batcher import StepBatcher
 from vergence_service.inference.model import RecurrentState, Step, StereoModel, StereoView
@@ -139,21 +141,29 @@ class DepthEngine:
         *,
         attachment: Attachment | None = None,
         client: str = "",
+        owner: Principal = LOCAL,
     ) -> Stream:
-        """Open a stream. It counts towards the limit of ``client``, an address.
+        """Open a stream of ``owner``. It counts towards its limits, and the one of ``client``.
+
+        ``client`` is an address.
 
         Raises NotReady or Draining if no streams are accepted, ModelChanged, BadCalibration or
         FrameTooLarge if the configuration cannot be served, BadShape if the id is not allowed,
         StreamExists if it is in use, and Quota, StreamLimit or StateMemory if a limit is reached.
         """
         self._check_model(config)
-        made = self.streams.made_by(stream_id, config.opening_id)
+        made = self.streams.made_by(stream_id, config.opening_id, owner=owner.name)
         if made is not None and attachment is not None:  # the client did not get the answer
             return self.resume(
-                stream_id, made.resume_token, config, attachment=attachment, client=client
+                stream_id,
+                made.resume_token,
+                config,
+                attachment=attachment,
+                client=client,
+                owner=owner,
             )
         need = await self._check_opening(config)
-        with self.streams.reserve(stream_id, need, client=client) as place:
+        with self.streams.reserve(stream_id, need, client=client, owner=owner) as place:
             rectifier = await self._rectifier(config.rig)
             return self.streams.open(place, config, rectifier, attachment=attachment)
 
@@ -165,6 +175,7 @@ class DepthEngine:
         *,
         attachment: Attachment,
         client: str = "",
+        owner: Principal = LOCAL,
     ) -> Stream:
         """Attach a new connection to an open stream.
 
@@ -177,7 +188,7 @@ class DepthEngine:
         # more, but the client must learn that a new stream would run on another network.
         self._check_model(config)
         return self.streams.attach(
-            stream_id, resume_token, config, attachment=attachment, client=client
+            stream_id, resume_token, config, attachment=attachment, client=client, owner=owner
         )
 
     async def step(
@@ -187,6 +198,7 @@ class DepthEngine:
         *,
         arrived_s: float,
         max_age_s: float | None = None,
+        owner: str = LOCAL.name,
     ) -> SteppedFrame:
         """Advance one stream by one frame. A step that fails leaves the stream unchanged.
 
@@ -198,7 +210,7 @@ class DepthEngine:
         BadShape, FrameOutOfOrder or FrameStale if the frame is refused; ModelFailed; Draining; and
         NonFinite, after which the stream starts again without a state.
         """
-        stream = self.streams.get(stream_id)
+        stream = self.streams.get(stream_id, owner=owner)
         self.streams.touch(stream)
         try:
             return await self._step(
@@ -256,9 +268,9 @@ class DepthEngine:
         )
         return await background.run(stepped.disparity_map), stepped.result.state
 
-    async def reset(self, stream_id: str) -> None:
+    async def reset(self, stream_id: str, *, owner: str = LOCAL.name) -> None:
         """Let later frames start without a state. Raises UnknownStream, StreamExpired."""
-        stream = self.streams.get(stream_id)
+        stream = self.streams.get(stream_id, owner=owner)
         async with stream.turn:
             stream.forget(Origin.RESET_REQUESTED)
 
@@ -274,14 +286,22 @@ class DepthEngine:
         stream.frames_skipped += 1
         self.metrics.frames_failed.labels(error.code).inc()
 
-    async def close(self, stream_id: str) -> None:
-        """End a stream and free its state; any connection may ask for it.
+    def end_those_of(self, gone: Callable[[Principal], bool]) -> None:
+        """End the streams of principals whose credential is gone."""
+        for stream in self.streams:
+            if gone(stream.owner):
+                self.streams.close(stream)
+                if stream.attachment is not None:
+                    stream.attachment.end(Unauthenticated("the token was removed"))
+
+    async def close(self, stream_id: str, *, owner: str = LOCAL.name) -> None:
+        """End a stream and free its state; any connection of its owner may ask for it.
 
         Returns when the stream's own connection has ended too, but after at most a second.
 
         Raises UnknownStream, StreamExpired.
         """
-        stream = self.streams.get(stream_id)
+        stream = self.streams.get(stream_id, owner=owner)
         self.streams.close(stream)
         if stream.attachment is not None:
             stream.attachment.end(UnknownStream(f"stream {stream_id!r} was closed"))
@@ -348,7 +368,7 @@ class DepthEngine:
                     Step(view, state, iterations),
                     timings=Timings(decode_s=decode_s, queue_s=started_s - arrived_s),
                     deadline_s=None if max_age_s is None else arrived_s + max_age_s,
-                    live_stream=stream.stream_id if live else None,
+                    live_stream=stream.key if live else None,
                 )
             except DepthError as error:
                 self.count_failed(stream, error)

@@ -8,6 +8,7 @@ from typing import Protocol
 from vergence_proto.errors import DepthError, FrameOutOfOrder
 from vergence_proto.geometry import Axes
 from vergence_proto.types import Delivery, Origin, OutputFormat, StereoRig
+from vergence_service.access.principals import LOCAL, Principal
 from vergence_service.inference.model import RecurrentState, StereoView
 from vergence_service.memory import MemoryHold
 from vergence_service.streams.continuity import ContinuityLimits, break_between
@@ -96,6 +97,12 @@ class Stream:
     frames_skipped: int = 0  # frames dropped or failed since the last stepped frame
     warned: bool = False  # the client knows that the stream will expire
     turn: asyncio.Lock = field(default_factory=asyncio.Lock)
+    owner: Principal = LOCAL
+
+    @property
+    def key(self) -> str:
+        """Name of the stream that no other open stream has."""
+        return key_of(self.owner.name, self.stream_id)
 
     def check_order(self, frame_id: int) -> None:
         """Raise FrameOutOfOrder unless the frame is newer than the last stepped one."""
@@ -127,3 +134,8 @@ class Stream:
         """Discard the state; the next step is cold."""
         self.state = None
         self.origin = reason
+
+
+def key_of(owner: str, stream_id: str) -> str:
+    """Return the name of a stream among those of all principals; neither part has a slash."""
+    return f"{owner}/{stream_id}"

@@ -19,10 +19,18 @@ from vergence_proto.errors import (
     UnknownStream,
 )
 from vergence_proto.types import Origin, StereoRig, checked_stream_id
+from vergence_service.access.principals import LOCAL, Principal
 from vergence_service.memory import MemoryBudget, MemoryHold, StreamMemory
 from vergence_service.metrics import Metrics
 from vergence_service.streams.rectify import Rectifier
-from vergence_service.streams.stream import Attachment, Notice, NoticeKind, Stream, StreamConfig
+from vergence_service.streams.stream import (
+    Attachment,
+    Notice,
+    NoticeKind,
+    Stream,
+    StreamConfig,
+    key_of,
+)
 
 # The server remembers for this long that a stream expired, and reports it as such.
 _TOMBSTONE_S = 300.0
@@ -35,10 +43,26 @@ class Place:
     stream_id: str
     client: str
     memory: MemoryHold
+    owner: Principal = LOCAL
+
+    @property
+    def key(self) -> str:
+        return key_of(self.owner.name, self.stream_id)
+
+
+@dataclass(frozen=True, slots=True)
+class _User:
+    """Whose a connection or an opening is."""
+
+    owner: str
+    client: str
 
 
 class StreamTable:
     """All streams of one server, within its limits. ``clock`` returns seconds.
+
+    A stream belongs to a principal. Two principals may both have a stream of one id, and each knows
+    only its own.
 
     ``on_closed`` is called with every stream that was closed or has expired.
     """
@@ -56,32 +80,40 @@ class StreamTable:
         clock: Callable[[], float],
         metrics: Metrics,
         on_closed: Callable[[Stream], None],
+        per_principal: int | None = None,
     ) -> None:
         self.capacity = capacity
         self.idle_timeout_s = idle_timeout_s
         self.detach_grace_s = detach_grace_s
         self._per_client = per_client
+        self._per_principal = per_principal
         self._memory = memory
         self._idle_notice_s = idle_notice_s
         self._silent_s = silent_s
         self._clock = clock
         self._metrics = metrics
         self._on_closed = on_closed
+        # By their keys: owner and id.
         self._streams: dict[str, Stream] = {}
-        self._opening: dict[str, str] = {}  # reserved places: the client of each stream id
+        self._opening: dict[str, _User] = {}  # reserved places
         self._expired_s: dict[str, float] = {}  # tombstones
-        # Connections that have lost their stream and must end, and the client of each. They count
+        # Connections that have lost their stream and must end, and the user of each. They count
         # towards the limits until they have ended.
-        self._leaving: dict[Attachment, str] = {}
+        self._leaving: dict[Attachment, _User] = {}
 
     def __len__(self) -> int:
         return len(self._streams)
+
+    def __iter__(self) -> Iterator[Stream]:
+        return iter(list(self._streams.values()))
 
     def attachments(self) -> Iterable[Attachment]:
         return [stream.attachment for stream in self._streams.values() if stream.attachment]
 
     @contextmanager
-    def reserve(self, stream_id: str, need: StreamMemory, *, client: str) -> Iterator[Place]:
+    def reserve(
+        self, stream_id: str, need: StreamMemory, *, client: str, owner: Principal = LOCAL
+    ) -> Iterator[Place]:
         """Reserve a place for a stream, to be used in the block. If the id is empty, choose one.
 
         What takes long to make for a stream is made in this block, so that no refused opening
@@ -94,20 +126,14 @@ class StreamTable:
         self.sweep()
         stream_id = stream_id or f"s-{secrets.token_hex(8)}"
         checked_stream_id(stream_id)
-        if stream_id in self._streams or stream_id in self._opening:
+        key = key_of(owner.name, stream_id)
+        if key in self._streams or key in self._opening:
             raise StreamExists(
                 f"stream {stream_id!r} is open; resume it with its token, close it, or choose "
                 "another id"
             )
-        theirs = [each for each in self._streams.values() if client and each.client == client]
         others = [*self._leaving.values(), *self._opening.values()]
-        count = len(theirs) + (others.count(client) if client else 0)
-        if self._per_client is not None and count >= self._per_client:
-            raise Quota(
-                f"{client} has {count} open streams, the limit per client; close one, or "
-                "try again later (the server's setting limits.streams_per_client)",
-                retry_after_s=self._next_expiry_s(theirs),
-            )
+        self._check_quotas(owner, client, others)
         if len(self._streams) + len(others) >= self.capacity:
             raise StreamLimit(
                 f"the server has {self.capacity} open streams, its limit; close one, or "
@@ -115,17 +141,36 @@ class StreamTable:
                 retry_after_s=self._next_expiry_s(self._streams.values()),
             )
         try:
-            place = Place(stream_id, client, self._memory.hold_stream(need))
+            place = Place(stream_id, client, self._memory.hold_stream(need), owner)
         except StateMemory as error:
             error.retry_after_s = self._next_expiry_s(self._streams.values())
             raise
-        self._opening[stream_id] = client
+        self._opening[key] = _User(owner.name, client)
         try:
             yield place
         finally:
-            del self._opening[stream_id]
-            if stream_id not in self._streams:
+            del self._opening[key]
+            if key not in self._streams:
                 place.memory.release()
+
+    def _check_quotas(self, owner: Principal, client: str, others: Iterable[_User]) -> None:
+        theirs = [each for each in self._streams.values() if each.owner.name == owner.name]
+        count = len(theirs) + sum(each.owner == owner.name for each in others)
+        most = owner.streams or self._per_principal
+        if owner.proven and most is not None and count >= most:
+            raise Quota(
+                f"{owner.name} has {count} open streams, the limit of one principal; close one, or "
+                "try again later (the server's setting limits.streams)",
+                retry_after_s=self._next_expiry_s(theirs),
+            )
+        here = [each for each in self._streams.values() if client and each.client == client]
+        count = len(here) + sum(bool(client) and each.client == client for each in others)
+        if self._per_client is not None and count >= self._per_client:
+            raise Quota(
+                f"{client} has {count} open streams, the limit per client; close one, or "
+                "try again later (the server's setting limits.streams_per_client)",
+                retry_after_s=self._next_expiry_s(here),
+            )
 
     def open(
         self,
@@ -136,7 +181,7 @@ class StreamTable:
         attachment: Attachment | None,
     ) -> Stream:
         """Open a stream at a place that :meth:`reserve` has reserved."""
-        self._expired_s.pop(place.stream_id, None)
+        self._expired_s.pop(place.key, None)
         stream = Stream(
             place.stream_id,
             place.client,
@@ -146,8 +191,9 @@ class StreamTable:
             place.memory,
             attachment,
             self._clock(),
+            owner=place.owner,
         )
-        self._streams[place.stream_id] = stream
+        self._streams[place.key] = stream
         self._metrics.streams_opened.inc()
         self._count()
         return stream
@@ -160,13 +206,14 @@ class StreamTable:
         *,
         attachment: Attachment,
         client: str,
+        owner: Principal = LOCAL,
     ) -> Stream:
         """Attach a new connection to an open stream; the newest connection wins.
 
         Raises UnknownStream or StreamExpired if the stream is gone, StreamExists if the token
         belongs to another stream, and BadCalibration if the rig has changed.
         """
-        stream = self.get(stream_id)
+        stream = self.get(stream_id, owner=owner.name)
         if not hmac.compare_digest(resume_token, stream.resume_token):
             raise StreamExists(f"stream {stream_id!r} is open, and the resume token is wrong")
         if not _same_rig(stream.config.rig, config.rig):
@@ -174,13 +221,14 @@ class StreamTable:
                 f"stream {stream_id!r} was opened with another rig; open a new stream for this one"
             )
         if stream.attachment is not None:
-            self._leaving[stream.attachment] = stream.client
+            self._leaving[stream.attachment] = _User(stream.owner.name, stream.client)
             stream.attachment.end(
                 Superseded(f"a newer connection attached to stream {stream_id!r}")
             )
         stream.config = config
         stream.attachment = attachment
         stream.client = client  # the client may have changed its network
+        stream.owner = owner  # and its token
         if stream.state is not None:
             stream.origin = Origin.RESUMED
         self.touch(stream)
@@ -193,26 +241,29 @@ class StreamTable:
             stream.attachment = None
             self.touch(stream)
 
-    def get(self, stream_id: str) -> Stream:
-        """Return an open stream.
+    def get(self, stream_id: str, *, owner: str = LOCAL.name) -> Stream:
+        """Return an open stream of a principal.
 
         Raises StreamExpired if it expired in the last five minutes, otherwise UnknownStream.
         """
-        stream = self._streams.get(stream_id)
+        key = key_of(owner, stream_id)
+        stream = self._streams.get(key)
         if stream is not None and self._clock() >= self._expiry_s(stream):
             self._expire(stream)
         elif stream is not None:
             return stream
-        if stream_id in self._expired_s:
+        if key in self._expired_s:
             raise StreamExpired(
                 f"stream {stream_id!r} had no connection for {self.detach_grace_s:g} s "
                 f"or without a frame for {self.idle_timeout_s:g} s; open it again"
             )
         raise UnknownStream(f"no open stream {stream_id!r}; open it before sending frames")
 
-    def made_by(self, stream_id: str, opening_id: bytes) -> Stream | None:
+    def made_by(
+        self, stream_id: str, opening_id: bytes, *, owner: str = LOCAL.name
+    ) -> Stream | None:
         """Return the open stream that an earlier message of the same opening has made."""
-        stream = self._streams.get(stream_id)
+        stream = self._streams.get(key_of(owner, stream_id))
         same = stream is not None and hmac.compare_digest(opening_id, stream.config.opening_id)
         return stream if same and opening_id else None
 
@@ -223,12 +274,12 @@ class StreamTable:
 
     def close(self, stream: Stream) -> None:
         """End a stream, and free its state and what was learnt about it."""
-        if self._streams.get(stream.stream_id) is stream:
-            del self._streams[stream.stream_id]
+        if self._streams.get(stream.key) is stream:
+            del self._streams[stream.key]
             self._metrics.streams_closed.inc()
             stream.memory.release()
             if stream.attachment is not None:
-                self._leaving[stream.attachment] = stream.client
+                self._leaving[stream.attachment] = _User(stream.owner.name, stream.client)
             self._count()
             self._on_closed(stream)
 
@@ -253,9 +304,9 @@ class StreamTable:
                 stream.warned = True
                 message = f"no frame for {now_s - stream.active_s:.0f} s: the stream will expire"
                 attachment.notify(Notice(NoticeKind.EXPIRING, message, left_s))
-        for stream_id, expired_s in list(self._expired_s.items()):
+        for key, expired_s in list(self._expired_s.items()):
             if now_s - expired_s > _TOMBSTONE_S:
-                del self._expired_s[stream_id]
+                del self._expired_s[key]
 
     def idle_s(self, stream: Stream) -> float:
         """Return the time since the stream was last in use."""
@@ -263,7 +314,7 @@ class StreamTable:
 
     def _expire(self, stream: Stream) -> None:
         self.close(stream)
-        self._expired_s[stream.stream_id] = self._clock()
+        self._expired_s[stream.key] = self._clock()
         if stream.attachment is not None:
             stream.attachment.end(
                 StreamExpired(

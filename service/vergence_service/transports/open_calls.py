@@ -6,6 +6,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from vergence_proto.codec import Request
 from vergence_proto.errors import Draining
 from vergence_proto.v1 import depth_pb2 as pb
+from vergence_service.access.principals import Principal
 from vergence_service.memory import MemoryBudget
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.transports.stream_call import DepthCall, StreamLimits
@@ -34,6 +35,7 @@ class OpenCalls:
         write: Callable[[pb.StreamDepthResponse], Awaitable[None]],
         *,
         client: str,
+        caller: Principal,
     ) -> DepthCall:
         """Make a call. ``client`` is the address it comes from, or empty if that is unknown."""
         return DepthCall(
@@ -41,6 +43,7 @@ class OpenCalls:
             requests,
             write,
             client=client,
+            caller=caller,
             limits=self.limits,
             clock=self._clock,
         )

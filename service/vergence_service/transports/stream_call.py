@@ -9,6 +9,7 @@ from vergence_proto import codec
 from vergence_proto.errors import DepthError, StreamExists, StreamExpired, UnknownStream
 from vergence_proto.types import Delivery
 from vergence_proto.v1 import depth_pb2 as pb
+from vergence_service.access.principals import Principal
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.stream import Notice, Stream, StreamConfig
 from vergence_service.transports.mailbox import Mailbox, QueuedFrame
@@ -25,7 +26,6 @@ class StreamLimits:
     """The limits of one call."""
 
     credit: int  # most frames that a client may send before an answer returns
-    paced_credit: int  # the same for a live client that paces them by the link
     waiting_frames: int  # frames of a lossless stream that wait before the sender must wait
     max_frame_bytes: int
     silent_s: float  # a client that pinged and sends nothing for this long counts as lost
@@ -50,6 +50,7 @@ class DepthCall:
         write: Callable[[pb.StreamDepthResponse], Awaitable[None]],
         *,
         client: str,
+        caller: Principal,
         limits: StreamLimits,
         clock: Callable[[], float],
     ) -> None:
@@ -57,6 +58,7 @@ class DepthCall:
         self._requests = requests
         self._write = write
         self._client = client
+        self._caller = caller
         self._limits = limits
         self._clock = clock
         self._outbox = Outbox(
@@ -130,7 +132,7 @@ class DepthCall:
         if self._error is not None:
             raise self._error
         if self._client_is_done:
-            await self._engine.close(stream.stream_id)
+            await self._engine.close(stream.stream_id, owner=stream.owner.name)
 
     async def _serve(self, stream: Stream) -> None:
         mailbox = Mailbox(stream.config.delivery, capacity=self._limits.waiting_frames)
@@ -189,10 +191,15 @@ class DepthCall:
                 config,
                 attachment=self,
                 client=self._client,
+                owner=self._caller,
             )
             return resumed, True
         opened = await self._engine.open(
-            request.stream_id, config, attachment=self, client=self._client
+            request.stream_id,
+            config,
+            attachment=self,
+            client=self._client,
+            owner=self._caller,
         )
         return opened, False
 
@@ -209,12 +216,7 @@ class DepthCall:
             last_frame_id=stream.last_frame_id,
             silent_s=self._limits.silent_s,
             max_frame_scale=codec.MAX_FRAME_SCALE,
-            paced_credit=self._most_unanswered(stream),
         )
-
-    def _most_unanswered(self, stream: Stream) -> int:
-        live = stream.config.delivery is Delivery.NEWEST
-        return self._limits.paced_credit if live else self._limits.credit
 
     async def _read(self, stream: Stream, mailbox: Mailbox) -> None:
         try:
@@ -242,7 +244,7 @@ class DepthCall:
         self, stream: Stream, mailbox: Mailbox, frame: codec.ReceivedFrame, arrived_s: float
     ) -> None:
         self._owed += 1
-        self._overran = self._overran or self._owed > self._most_unanswered(stream)
+        self._overran = self._overran or self._owed > self._limits.credit
         rig = stream.rectifier.rig
         try:
             codec.check_frame(
@@ -289,18 +291,19 @@ class DepthCall:
             fields = queued.frame.fields
             try:
                 if queued.reset_before:
-                    await self._engine.reset(stream.stream_id)
+                    await self._engine.reset(stream.stream_id, owner=stream.owner.name)
                 stepped = await self._engine.step(
                     stream.stream_id,
                     partial(codec.decode_frame, queued.frame, size=size),
                     arrived_s=queued.arrived_s,
+                    owner=stream.owner.name,
                     max_age_s=fields.max_age_s if fields.HasField("max_age_s") else None,
                 )
             except DepthError as error:
                 self._outbox.release_map()
                 await self._refuse(queued.frame_id, error)
             else:
-                await self._outbox.put_map(stepped, map_step=fields.map_step)
+                await self._outbox.put_map(stepped)
                 self._answered()
             finally:
                 queued.memory.release()

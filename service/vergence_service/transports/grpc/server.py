@@ -15,14 +15,19 @@ from grpc_reflection.v1alpha import reflection
 
 from vergence_proto.codec import Request, read_request, read_small
 from vergence_proto.v1 import depth_pb2 as pb
+from vergence_service.access.gate import Gate
+from vergence_service.access.principals import Principal
 from vergence_service.transports.addresses import format_address, listening_socket
+from vergence_service.transports.callers import CALLER
 from vergence_service.transports.errors import PortTaken
 from vergence_service.transports.grpc.deadlines import FirstMessageDeadline
 from vergence_service.transports.grpc.errors import Context, errors_as_status
 from vergence_service.transports.grpc.hang_up import hang_up
+from vergence_service.transports.grpc.identity import Identity
 from vergence_service.transports.grpc.small_requests import SmallRequests
 from vergence_service.transports.open_calls import FINISHING_SHARE, OpenCalls
 from vergence_service.transports.stream_call import ClientLost
+from vergence_service.transports.tls import Certificate
 from vergence_service.transports.unary import UnaryMethods
 
 log = logging.getLogger(__name__)
@@ -67,7 +72,7 @@ async def _write(context: Context, response: pb.StreamDepthResponse) -> None:
         ) from None
 
 
-_Answer = tuple[type[Message], Callable[[Any], Awaitable[Message]]]
+_Answer = tuple[type[Message], Callable[[Any, Principal], Awaitable[Message]]]
 
 
 def _host_of(peer: str) -> str:
@@ -99,7 +104,9 @@ class DepthServicer:
         async with errors_as_status(context):
             peer = context.peer()
             write = partial(_write, context)
-            call = self.calls.make(_requests(messages), write, client=_host_of(peer))
+            call = self.calls.make(
+                _requests(messages), write, client=_host_of(peer), caller=CALLER.get()
+            )
             self._by_peer[peer] += 1
             try:
                 await self.calls.run(call)
@@ -116,11 +123,11 @@ class DepthServicer:
 
 
 def _unary(
-    question: type[Message], answer: Callable[[Any], Awaitable[Message]]
+    question: type[Message], answer: Callable[[Any, Principal], Awaitable[Message]]
 ) -> "grpc.RpcMethodHandler[Any, Any]":
     async def handle(request: bytes, context: Context) -> bytes:
         async with errors_as_status(context):
-            return (await answer(read_small(question, request))).SerializeToString()
+            return (await answer(read_small(question, request), CALLER.get())).SerializeToString()
 
     return grpc.unary_unary_rpc_method_handler(handle)
 
@@ -140,7 +147,11 @@ class GrpcServer:
         max_frame_bytes: int,
         max_connections: int,
         first_message_s: float,
+        gate: Gate,
+        certificate: Certificate | None = None,
     ) -> None:
+        self._gate = gate
+        self._certificate = certificate
         self._servicer = servicer
         self._host = host
         self._max_connections = max_connections
@@ -151,7 +162,11 @@ class GrpcServer:
 
     async def __aenter__(self) -> Self:
         self._server = grpc.aio.server(
-            interceptors=[FirstMessageDeadline(self._first_message_s), SmallRequests()],
+            interceptors=[
+                Identity(self._gate),
+                FirstMessageDeadline(self._first_message_s),
+                SmallRequests(),
+            ],
             maximum_concurrent_rpcs=self._max_connections + _MORE_CALLS,
             options=[
                 # On by default, two servers would share the port and split streams silently.
@@ -176,7 +191,11 @@ class GrpcServer:
         listening_socket(self._host, self.port, transport="grpc").close()
         address = format_address(self._host, self.port)
         try:
-            self.port = self._server.add_insecure_port(address)
+            self.port = (
+                self._server.add_insecure_port(address)
+                if self._certificate is None
+                else self._server.add_secure_port(address, self._certificate.grpc_credentials())
+            )
         except RuntimeError as error:
             raise PortTaken(address, "grpc", OSError(str(error))) from None
         await self._server.start()

@@ -12,11 +12,13 @@ from fastapi import APIRouter, FastAPI, Response
 from fastapi.openapi.utils import get_openapi
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
 from pydantic.json_schema import models_json_schema
+from starlette.types import ASGIApp
 
 from vergence_service.transports.http.connections import BoundedConnection, ConnectionLimits
 from vergence_service.transports.http.errors import Problem, install_problems
 from vergence_service.transports.http.uploads import SequenceForm
 from vergence_service.transports.open_calls import FINISHING_SHARE, OpenCalls
+from vergence_service.transports.tls import Certificate
 
 _ABOUT = """Disparity of whole stereo sequences, as a job, and of single pairs.
 
@@ -36,7 +38,9 @@ def make_http_app(
     routes: Sequence[APIRouter],
 ) -> FastAPI:
     """Make the application from its routes."""
-    app = FastAPI(title="Vergence", version=version, description=_ABOUT, redoc_url=None)
+    app = FastAPI(
+        title="Vergence", version=version, description=_ABOUT, docs_url=None, redoc_url=None
+    )
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign] # as FastAPI documents it
     install_problems(app)
     for router in (_health_routes(ready, registry), *routes):
@@ -102,13 +106,17 @@ class HttpServer:
 
     def __init__(
         self,
-        app: FastAPI,
+        app: ASGIApp,
         calls: OpenCalls,
         *,
         listening: socket.socket,
         limits: ConnectionLimits,
         stopping: asyncio.Event,
+        certificate: Certificate | None = None,
+        trusted_proxies: Sequence[str] = (),
     ) -> None:
+        self._certificate = certificate
+        self._trusted_proxies = list(trusted_proxies)
         self._app = app
         self._limits = limits
         self._calls = calls
@@ -125,7 +133,12 @@ class HttpServer:
             log_config=None,
             access_log=False,
             lifespan="off",
+            proxy_headers=bool(self._trusted_proxies),
+            forwarded_allow_ips=self._trusted_proxies,
         )
+        if self._certificate is not None:
+            config.load()
+            config.ssl = self._certificate.context
         self._server = _Uvicorn(config)
         self._task = asyncio.create_task(self._server.serve([self._socket]), name="http")
         return self

@@ -2,6 +2,7 @@
 
 import asyncio
 import socket
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,8 +43,12 @@ class BoundedConnection(H11Protocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override] # as uvicorn's
         super().connection_made(transport)
         _keep_alive(transport.get_extra_info("socket"))
-        # Every byte that the client has not read is noticed.
-        transport.set_write_buffer_limits(high=0)
+        names = _certificate_names(transport.get_extra_info("peercert") or {})
+        self.app_state = {**self.app_state, "certificate_names": names}
+        # Every byte that the client has not read is noticed. Over TLS, no bytes at all would reach
+        # a limit of 0.
+        over_tls = transport.get_extra_info("sslcontext") is not None
+        transport.set_write_buffer_limits(high=int(over_tls), low=0)
         if len(self.connections) > self._limits.connections:
             transport.write(_TOO_MANY)
             transport.close()
@@ -94,6 +99,13 @@ class BoundedConnection(H11Protocol):
             self.transport.abort()
         else:
             self._expect_reading()
+
+
+def _certificate_names(certificate: Mapping[str, Any]) -> list[str]:
+    """Return the names in a client's certificate: alternative names, then the common name."""
+    names = [name for _, name in certificate.get("subjectAltName", ())]
+    subject = [pair for group in certificate.get("subject", ()) for pair in group]
+    return names + [name for kind, name in subject if kind == "commonName"]
 
 
 def _keep_alive(connection: socket.socket) -> None:

@@ -27,6 +27,8 @@ HTTP_STATUS: Mapping[ErrorCode, int] = {
     ErrorCode.BAD_SHAPE: 400,
     ErrorCode.BAD_CALIBRATION: 400,
     ErrorCode.BAD_SEQUENCE: 400,
+    ErrorCode.UNAUTHENTICATED: 401,
+    ErrorCode.FORBIDDEN: 403,
     ErrorCode.CLIENT_TIMEOUT: 408,
     ErrorCode.STREAM_UNKNOWN: 404,
     ErrorCode.SEQUENCE_UNKNOWN: 404,
@@ -95,7 +97,7 @@ def install_problems(app: FastAPI) -> None:
 
     @app.exception_handler(DepthError)
     async def _refused(request: Request, error: DepthError) -> JSONResponse:
-        return _response(problem_of(error), retry_after_s=error.retry_after_s)
+        return refusal_of(error)
 
     @app.exception_handler(RequestValidationError)
     async def _invalid(request: Request, error: RequestValidationError) -> JSONResponse:
@@ -123,6 +125,12 @@ def install_problems(app: FastAPI) -> None:
     async def _unforeseen(request: Request, error: Exception) -> JSONResponse:
         known = error_of(error, log, "a request")
         return _response(problem_of(known), retry_after_s=known.retry_after_s)
+
+
+def refusal_of(error: DepthError) -> JSONResponse:
+    """Return the answer to a request that was refused."""
+    headers = {"WWW-Authenticate": "Bearer"} if error.code is ErrorCode.UNAUTHENTICATED else {}
+    return _response(problem_of(error), retry_after_s=error.retry_after_s, headers=headers)
 
 
 def _response(

@@ -22,6 +22,7 @@ from vergence_service.jobs.progress import JobStatus
 from vergence_service.jobs.queue import JobOrder, JobQueue
 from vergence_service.jobs.registry import JobRegistry
 from vergence_service.threads import ThreadPool
+from vergence_service.transports.callers import CALLER
 from vergence_service.transports.http.errors import PROBLEM_RESPONSE
 from vergence_service.transports.http.sequence_models import ResultQuery, SequenceJob, SubmitQuery
 from vergence_service.transports.http.uploads import (
@@ -103,12 +104,14 @@ def sequence_routes(
             ),
             name=query.name,
         )
-        client = client_of(request)
+        client, caller = client_of(request), CALLER.get()
         upload_bytes = int(request.headers.get("content-length", 0))
-        async with queue.upload_folder(client, upload_bytes=upload_bytes) as folder:
+        async with queue.upload_folder(client, upload_bytes=upload_bytes, owner=caller) as folder:
             digest = await receive_sequence(request, folder, limits, threads)
             async with while_connected(request):
-                status = await queue.accept(folder, order, upload_sha256=digest, client=client)
+                status = await queue.accept(
+                    folder, order, upload_sha256=digest, client=client, owner=caller
+                )
         job_id = status.job.job_id
         if query.wait:
             while not (status := jobs.status(job_id)).job.ended and not stopping.is_set():
@@ -128,12 +131,13 @@ def sequence_routes(
 
     @router.get("/v1/sequences")
     async def list_sequences() -> list[SequenceJob]:
-        """List all jobs, oldest first."""
-        return [SequenceJob.of(status) for status in jobs.statuses()]
+        """List the jobs of the caller, oldest first; none if the server asks for no credential."""
+        return [SequenceJob.of(status) for status in jobs.statuses(CALLER.get())]
 
     @router.get("/v1/sequences/{job_id}")
     async def get_sequence(job_id: str) -> SequenceJob:
         """Get the state and the progress of a job."""
+        jobs.check_owner(job_id, CALLER.get())
         return SequenceJob.of(jobs.status(job_id))
 
     @router.get(
@@ -148,7 +152,7 @@ def sequence_routes(
     )
     async def events(job_id: str) -> StreamingResponse:
         """Follow the progress of a job."""
-        jobs.status(job_id)
+        jobs.check_owner(job_id, CALLER.get())
         return StreamingResponse(
             _events(jobs, job_id, stopping),
             media_type="text/event-stream",
@@ -160,11 +164,13 @@ def sequence_routes(
     )
     async def result(job_id: str, query: Annotated[ResultQuery, Query()]) -> Response:
         """Download the result. It is encoded while it is sent."""
+        jobs.check_owner(job_id, CALLER.get())
         return await _result(jobs, job_id, query.format, threads)
 
     @router.delete("/v1/sequences/{job_id}", status_code=204)
     async def delete(job_id: str) -> None:
         """Cancel the job if it has not ended, and delete all its files."""
+        jobs.check_owner(job_id, CALLER.get())
         await queue.delete(job_id)
 
     return router

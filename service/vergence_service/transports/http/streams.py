@@ -23,7 +23,9 @@ from vergence_proto.http_records import (
     pack_record,
 )
 from vergence_proto.v1 import depth_pb2 as pb
+from vergence_service.access.principals import Principal
 from vergence_service.failures import error_of
+from vergence_service.transports.callers import CALLER
 from vergence_service.transports.http.bodies import body_of
 from vergence_service.transports.http.errors import PROBLEM_RESPONSE, log
 from vergence_service.transports.http.uploads import client_of
@@ -54,10 +56,11 @@ def stream_routes(
         return await _collected(chunks, limit, received)
 
     def method(
-        question: type[Any], answer: Callable[[Any], Coroutine[Any, Any, Message]]
+        question: type[Any], answer: Callable[[Any, Principal], Coroutine[Any, Any, Message]]
     ) -> _Method:
         async def ask(request: Request) -> Message:
-            return await answer(codec.read_small(question, await body(request, MAX_SMALL_BYTES)))
+            message = codec.read_small(question, await body(request, MAX_SMALL_BYTES))
+            return await answer(message, CALLER.get())
 
         return ask
 
@@ -78,7 +81,7 @@ def stream_routes(
     )
     async def open_stream(request: Request) -> StreamingResponse:
         """Open or resume a stream with a StreamDepthRequest. The answers come as records."""
-        call = _HttpCall(calls, client=client_of(request))
+        call = _HttpCall(calls, client=client_of(request), caller=CALLER.get())
         first = await call.begin(codec.read_request(await body(request, MAX_SMALL_BYTES)))
         open_calls[call.call_id] = call
 
@@ -98,7 +101,7 @@ def stream_routes(
     @router.post("/v1/streams/{call_id}", status_code=204, openapi_extra=_BODY)
     async def send(call_id: str, request: Request) -> None:
         """Send one StreamDepthRequest to an open call. Waits while the call accepts no more."""
-        if call_id not in open_calls:
+        if call_id not in open_calls or open_calls[call_id].caller.name != CALLER.get().name:
             raise UnknownStream("no open call has this id; open or resume the stream")
         call = open_calls[call_id]
         try:
@@ -134,7 +137,8 @@ def stream_routes(
 class _HttpCall:
     """Translates between requests and a DepthCall."""
 
-    def __init__(self, calls: OpenCalls, *, client: str) -> None:
+    def __init__(self, calls: OpenCalls, *, client: str, caller: Principal) -> None:
+        self.caller = caller
         self.call_id = secrets.token_urlsafe(16)
         self._client = client
         self._calls = calls
@@ -147,7 +151,9 @@ class _HttpCall:
 
     async def begin(self, opening: codec.Request) -> bytes:
         """Start the call; return the first record of its answer. Raises the opening's error."""
-        self._call = self._calls.make(self._requests(opening), self._write, client=self._client)
+        self._call = self._calls.make(
+            self._requests(opening), self._write, client=self._client, caller=self.caller
+        )
         self._task = asyncio.create_task(self._run(), name="HTTP call")
         first = await self._outgoing.get()
         if self._refusal is not None:

@@ -13,6 +13,7 @@ from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.zenoh.inbox import Inbox
 from vergence_proto.zenoh.keys import OPEN, StreamKeys, query_key
 from vergence_proto.zenoh.session import Declaration, ZenohSession
+from vergence_service.access.principals import Principal
 from vergence_service.transports.open_calls import OpenCalls
 from vergence_service.transports.stream_call import ClientLost
 from vergence_service.transports.zenoh.errors import status_of
@@ -36,6 +37,7 @@ class ZenohCall:
         *,
         namespace: str,
         attachment_id: str,
+        caller: Principal,
         calls: OpenCalls,
     ) -> None:
         self._peer = peer
@@ -45,7 +47,7 @@ class ZenohCall:
         self._attachment_id = attachment_id
         self._calls = calls
         self._live = opening.delivery != pb.DELIVERY_EVERY
-        self._call = calls.make(self._requests(), self._write, client="")
+        self._call = calls.make(self._requests(), self._write, client="", caller=caller)
         self._inbox = Inbox(
             attachment_id,
             bulky=pb.Frame,
@@ -92,10 +94,8 @@ class ZenohCall:
     async def _note(self, frame_id: int) -> None:
         last = self._last_frame_id
         if last is not None:
-            # No more frames of a client wait for an answer, so no more can be missing.
-            limits = self._calls.limits
-            most = limits.paced_credit if self._live else limits.credit
-            oldest = max(last + 1, frame_id - most)
+            # At most ``credit`` frames of a client wait for an answer, so no more can be missing.
+            oldest = max(last + 1, frame_id - self._calls.limits.credit)
             await self._call.report_lost(range(oldest, frame_id))
         self._last_frame_id = frame_id
         self._unanswered.add(frame_id)

@@ -14,6 +14,8 @@ from vergence_proto.errors import BadShape, DepthError
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.zenoh.keys import ANY, OPEN, UNARY_KEYS, StreamKeys, query_key, server_key
 from vergence_proto.zenoh.session import ZenohSession, make_config, reason_of
+from vergence_service.access.gate import Gate
+from vergence_service.access.principals import Principal
 from vergence_service.transports.errors import ZenohUnreachable
 from vergence_service.transports.open_calls import FINISHING_SHARE, OpenCalls
 from vergence_service.transports.unary import UnaryMethods
@@ -26,6 +28,7 @@ log = logging.getLogger(__name__)
 _ROOM_OVER_THE_LIMIT = 1.25
 
 Question = TypeVar("Question", bound=Message)
+_Method = Callable[[Any, Principal], Awaitable[Message]]
 
 
 def zenoh_config(
@@ -63,12 +66,19 @@ class ZenohServer:
     """
 
     def __init__(
-        self, unary: UnaryMethods, calls: OpenCalls, *, config: zenoh.Config, namespace: str
+        self,
+        unary: UnaryMethods,
+        calls: OpenCalls,
+        *,
+        gate: Gate,
+        config: zenoh.Config,
+        namespace: str,
     ) -> None:
+        self._gate = gate
         self._calls = calls
         self._namespace = namespace
         self._peer = ZenohSession(config)
-        self._methods: Mapping[str, tuple[type[Message], Callable[[Any], Awaitable[Message]]]] = {
+        self._methods: Mapping[str, tuple[type[Message], _Method]] = {
             UNARY_KEYS["GetServerInfo"]: (pb.GetServerInfoRequest, unary.server_info),
             UNARY_KEYS["GetStream"]: (pb.GetStreamRequest, unary.stream),
             UNARY_KEYS["ResetStream"]: (pb.ResetStreamRequest, unary.reset),
@@ -141,6 +151,7 @@ class ZenohServer:
                 opening,
                 namespace=self._namespace,
                 attachment_id=attachment_id,
+                caller=self._gate.named(""),
                 calls=self._calls,
             )
             await call.run()
@@ -150,7 +161,7 @@ class ZenohServer:
             if what not in self._methods:
                 raise BadShape(f"expected one of {', '.join([OPEN, *self._methods])}, got {what!r}")
             question, method = self._methods[what]
-            answer = await method(_read(query, question))
+            answer = await method(_read(query, question), self._gate.named(""))
         except Exception as error:
             await self._peer.refuse(query, status_of(error))
         else:

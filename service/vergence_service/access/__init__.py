@@ -1,0 +1,1 @@
+"""Who calls: principals, their tokens and certificates. Read ``principals``, then ``tokens``."""

@@ -1,0 +1,68 @@
+"""The gate in front of every gRPC call."""
+
+import inspect
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from typing import Any
+
+import grpc
+
+from vergence_service.access.gate import Gate
+from vergence_service.transports.callers import CALLER
+from vergence_service.transports.grpc.errors import Context, errors_as_status
+
+# A load balancer asks for the health without a credential.
+_OPEN = "/grpc.health.v1.Health/"
+
+
+class Identity(grpc.aio.ServerInterceptor):  # type: ignore[type-arg] # of its stubs only
+    """Refuses a call without a valid credential, and names the caller of every other one."""
+
+    def __init__(self, gate: Gate) -> None:
+        self._gate = gate
+
+    async def intercept_service(
+        self,
+        continuation: Callable[[grpc.HandlerCallDetails], Awaitable[Any]],
+        handler_call_details: grpc.HandlerCallDetails,
+    ) -> Any:
+        """Return the handler of a call, behind the gate."""
+        handler = await continuation(handler_call_details)
+        if handler is None or handler_call_details.method.startswith(_OPEN):
+            return handler
+        metadata = dict(handler_call_details.invocation_metadata or ())
+        authorization = metadata.get("authorization")
+        if isinstance(authorization, bytes):
+            authorization = authorization.decode("latin-1")
+        changed = {
+            kind: self._behind(behaviour, authorization)
+            for kind in ("unary_unary", "unary_stream", "stream_unary", "stream_stream")
+            if (behaviour := getattr(handler, kind)) is not None
+        }
+        return handler._replace(**changed)
+
+    def _behind(self, behaviour: Callable[..., Any], authorization: str | None) -> Any:
+        async def answer(request: Any, context: Context) -> Any:
+            async with errors_as_status(context):
+                self._admit(context, authorization)
+            return await behaviour(request, context)
+
+        async def answers(request: Any, context: Context) -> AsyncIterator[Any]:
+            async with errors_as_status(context):
+                self._admit(context, authorization)
+            async for each in behaviour(request, context):
+                yield each
+
+        return answers if inspect.isasyncgenfunction(behaviour) else answer
+
+    def _admit(self, context: Context, authorization: str | None) -> None:
+        CALLER.set(self._gate.caller(authorization, _certificate_names(context)))
+
+
+def _certificate_names(context: Context) -> Sequence[str]:
+    """Return the names in the client's certificate: alternative names, then the common name."""
+    properties = context.auth_context()
+    names = [
+        *properties.get("x509_subject_alternative_name", ()),
+        *properties.get("x509_common_name", ()),
+    ]
+    return [name.decode("utf-8", "replace") for name in names]
