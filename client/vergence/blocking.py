@@ -8,7 +8,7 @@ import os
 import threading
 from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Literal, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -336,6 +336,7 @@ class BlockingClient:
         resume_token: bytes = b"",
         on_event: Callable[[SessionEvent], None] | None = None,
         on_lost: OnLost = "restart",
+        link: Literal["auto", "fixed"] | None = None,
         open_timeout_s: float = 10.0,
     ) -> BlockingSession:
         """Make a session; its ``with`` opens the stream and ends it.
@@ -374,6 +375,12 @@ class BlockingClient:
             What to do when the server does not have the stream any more, because it was restarted
             or has discarded the stream. ``"restart"``: go on with a new stream, whose first result
             is a cold start. ``"raise"``: end the session with the error.
+        link
+            ``"auto"``: measure the link, send frames at the pace of its slowest part, and choose
+            the quality of JPEG, half size and ``map_step`` by what it takes, unless ``encoding``,
+            ``jpeg_quality`` or ``output.map_step`` fix them. ``"fixed"``: send what was asked for,
+            within the credit. Default: ``"auto"`` for live sessions with a server elsewhere.
+            :attr:`BlockingSession.link` shows the choice.
         open_timeout_s
             The time in seconds for which a server that cannot be reached, is not ready or has no
             room is asked again.
@@ -401,6 +408,7 @@ class BlockingClient:
             resume_token=resume_token,
             on_event=on_event,
             on_lost=on_lost,
+            link=link,
             open_timeout_s=open_timeout_s,
         )
         return BlockingSession(session, self._loop)

@@ -5,13 +5,14 @@ import weakref
 from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
 from pathlib import Path
-from typing import Self
+from typing import Literal, Self
 
 from vergence.attaching import OnLost, RecoveryRules
 from vergence.errors import NotOpen
 from vergence.image_format import ImageFormat
 from vergence.info import ServerInfo, StreamInfo
 from vergence.info_codec import server_info_from_proto, stream_info_from_proto
+from vergence.link import LinkRules
 from vergence.results import SessionEvent
 from vergence.session import DepthSession
 from vergence.session_facts import SessionSetup
@@ -20,7 +21,14 @@ from vergence.transports.base import Transport
 from vergence.units import warn_of_baseline
 from vergence_proto import codec
 from vergence_proto.geometry import Axes, RectifiedRig
-from vergence_proto.types import Delivery, ImageEncoding, OutputFormat, StereoRig, checked_stream_id
+from vergence_proto.types import (
+    Delivery,
+    ImageEncoding,
+    OutputFormat,
+    PlaneEncoding,
+    StereoRig,
+    checked_stream_id,
+)
 from vergence_proto.v1 import depth_pb2 as pb
 
 _THREADS = 2  # one encodes while the other decodes
@@ -99,6 +107,7 @@ class DepthClient:
         resume_token: bytes = b"",
         on_event: Callable[[SessionEvent], None] | None = None,
         on_lost: OnLost = "restart",
+        link: Literal["auto", "fixed"] | None = None,
         open_timeout_s: float = 10.0,
     ) -> DepthSession:
         """Make a session; its ``async with`` opens the stream and ends it.
@@ -137,6 +146,12 @@ class DepthClient:
             What to do when the server does not have the stream any more, because it was restarted
             or has discarded the stream. ``"restart"``: go on with a new stream, whose first result
             is a cold start. ``"raise"``: end the session with the error.
+        link
+            ``"auto"``: measure the link, send frames at the pace of its slowest part, and choose
+            the quality of JPEG, half size and ``map_step`` by what it takes, unless ``encoding``,
+            ``jpeg_quality`` or ``output.map_step`` fix them. ``"fixed"``: send what was asked for,
+            within the credit. Default: ``"auto"`` for live sessions with a server elsewhere.
+            :attr:`DepthSession.link` shows the choice.
         open_timeout_s
             The time in seconds for which a server that cannot be reached, is not ready or has no
             room is asked again.
@@ -150,9 +165,15 @@ class DepthClient:
         NotOpen
             The client is not open.
         """
+        if link not in (None, "auto", "fixed"):
+            raise ValueError(f"expected link as 'auto' or 'fixed', got {link!r}")
         transport = self._open_transport()
         small = delivery is Delivery.NEWEST and not self._on_this_machine
         warn_of_baseline(rig)
+        adapts = delivery is Delivery.NEWEST and (link == "auto" or (small and link is None))
+        chosen = (output or OutputFormat(compressed=adapts or not self._on_this_machine)).resolved(
+            small=small or adapts
+        )
         opening = pb.OpenStream(
             stream_id=checked_stream_id(uuid.uuid4().hex if stream_id is None else stream_id),
             resume_token=resume_token,
@@ -161,9 +182,7 @@ class DepthClient:
             ),
             axes=codec.axes_to_proto(axes),
             delivery=codec.delivery_to_proto(delivery),
-            output=codec.output_format_to_proto(
-                (output or OutputFormat(compressed=not self._on_this_machine)).resolved(small=small)
-            ),
+            output=codec.output_format_to_proto(chosen),
             iterations=iterations,
             cold_iterations=cold_iterations,
             weights_sha256=weights_sha256,
@@ -173,7 +192,14 @@ class DepthClient:
                 transport=transport,
                 opening=opening,
                 delivery=delivery,
-                images=_image_format(encoding, jpeg_quality, small=small),
+                link=LinkRules(
+                    images=_image_format(encoding, jpeg_quality, small=small or adapts),
+                    map_step=chosen.map_step,
+                    adapts=adapts,
+                    fixed_images=encoding is not None or jpeg_quality is not None,
+                    fixed_maps=(output is not None and output.map_step != 0)
+                    or chosen.encoding is not PlaneEncoding.UINT16,
+                ),
                 threads=self._threads,
                 on_event=on_event,
                 rules=RecoveryRules(on_lost, open_timeout_s),

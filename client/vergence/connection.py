@@ -3,9 +3,11 @@
 import asyncio
 import time
 from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 from vergence.attaching import RecoveryRules, StreamAttacher
+from vergence.link import SessionLink
 from vergence.results import EventKind, SessionEvent, SessionState
 from vergence.silence import Silence
 from vergence.transports.base import Call, ConnectionLost, Transport
@@ -19,11 +21,22 @@ from vergence_proto.errors import (
 )
 from vergence_proto.v1 import depth_pb2 as pb
 
-Request = bytes | Callable[[], Awaitable[bytes | None]]
-"""A serialized ``pb.StreamDepthRequest``, or a function that makes it when its turn has come."""
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameRequest:
+    """A frame to send."""
+
+    frame_id: int
+    content: Callable[[], Awaitable[bytes | None]]
+    """Make the serialized request when its turn has come; None: the frame is not wanted."""
+
+
+Request = bytes | FrameRequest
+"""A serialized ``pb.StreamDepthRequest``, or a frame."""
 
 RESET = pb.StreamDepthRequest(reset=pb.Reset()).SerializeToString()
 _END = pb.StreamDepthRequest(end=pb.End()).SerializeToString()
+_PING = pb.StreamDepthRequest(ping=pb.Ping()).SerializeToString()  # its time is that of sending
 
 _CLOSE_TIMEOUT_S = 2.0
 _LOOK_INTERVAL_S = 0.1
@@ -68,7 +81,9 @@ class StreamConnection:
         listener: StreamListener,
         on_event: Callable[[SessionEvent], None] | None,
         rules: RecoveryRules,
+        link: SessionLink,
     ) -> None:
+        self._link = link
         self._listener = listener
         self._on_event = on_event
         self._attacher = StreamAttacher(transport, opening, rules, self._report)
@@ -107,6 +122,7 @@ class StreamConnection:
     def send(self, request: Request) -> None:
         """Queue a request."""
         self._silence.active()
+        self._link.waiting += isinstance(request, FrameRequest)
         self._outbox.put_nowait(request)
 
     def end(self) -> None:
@@ -176,17 +192,42 @@ class StreamConnection:
     async def _send_all(self, call: Call) -> None:
         while True:
             request = await self._outbox.get()
-            content = request if isinstance(request, bytes) else await request()
-            if content is not None:
-                self._silence.sent(content)
-                await call.send(content)
+            if isinstance(request, FrameRequest):
+                await self._send_frame(call, request)
+            elif request == _PING:
+                await self._send_ping(call)
+            else:
+                self._silence.sent(request)
+                await call.send(request)
+
+    async def _send_frame(self, call: Call, frame: FrameRequest) -> None:
+        try:
+            content = await frame.content()
+            if content is None:
+                return
+            ping_ns: int | None = None
+            if self._silence.ping_due:
+                # Just before a frame, the ping measures how long the frame's bytes take.
+                ping_ns = await self._send_ping(call)
+            self._silence.sent(content)
+            self._link.frame_sent(frame.frame_id, len(content), ping_ns=ping_ns)
+            await call.send(content)
+        finally:
+            self._link.waiting -= 1
+
+    async def _send_ping(self, call: Call) -> int:
+        ping = pb.Ping(client_ns=time.monotonic_ns())
+        self._silence.pinged(ping)
+        await call.send(pb.StreamDepthRequest(ping=ping).SerializeToString())
+        return ping.client_ns
 
     async def _ping(self) -> None:
+        self._outbox.put_nowait(_PING)
         while True:
-            ping = pb.Ping(client_ns=time.monotonic_ns())
-            self._silence.pinged(ping)
-            self._outbox.put_nowait(pb.StreamDepthRequest(ping=ping).SerializeToString())
-            await asyncio.sleep(self._silence.ping_interval_s)
+            # A frame takes the ping along, if one comes.
+            await asyncio.sleep(self._silence.ping_interval_s / 2)
+            if self._silence.ping_late:
+                self._outbox.put_nowait(_PING)
 
     async def _replacement(self, talk: asyncio.Task[DepthError | None]) -> Call | None:
         """Wait for the end of a call; return another call if this one is silent for too long."""
@@ -257,6 +298,7 @@ class StreamConnection:
         assert self._attacher.opened is not None
         # Requests queued for the last connection are sent again, or too old to be sent.
         self._outbox = asyncio.Queue()
+        self._link.attached(self._attacher.opened)
         for request in self._listener.attached(self._attacher.opened):
             self.send(request)
         if self._ending:
@@ -266,6 +308,7 @@ class StreamConnection:
 
     async def _take(self, response: pb.StreamDepthResponse) -> None:
         self._silence.heard(response)
+        self._link.heard(response)
         match response.WhichOneof("message"):
             case "pong":
                 pass

@@ -31,11 +31,13 @@ def frame_request(
     form: ImageFormat,
     *,
     size: tuple[int, int],
+    map_step: int = 0,
     max_age_s: float | None,
 ) -> bytes | Callable[[], bytes]:
     """Check a frame and return its request, or the function that makes it, for another thread.
 
-    The caller may change the images afterwards. ``size`` is the (width, height) of the rig.
+    The caller may change the images afterwards. ``size`` is the (width, height) of the rig,
+    ``map_step`` that of the answer (0: the stream's).
 
     Raises
     ------
@@ -53,6 +55,7 @@ def frame_request(
             encoding=form.encoding,
             jpeg_quality=form.jpeg_quality,
             scale=form.scale,
+            map_step=map_step,
             max_age_s=max_age_s,
         )
 

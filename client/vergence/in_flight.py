@@ -64,6 +64,10 @@ class FramesInFlight:
                 self.count(lost=1)
             frame.fail(error)
 
+    def __len__(self) -> int:
+        """Return the number of frames without an answer."""
+        return len(self._by_id)
+
     def __contains__(self, frame_id: int) -> bool:
         """Return True if the frame has no answer yet."""
         return frame_id in self._by_id

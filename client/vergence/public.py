@@ -5,6 +5,7 @@ from vergence.client import DepthClient
 from vergence.errors import NotOpen, WrongDelivery
 from vergence.filters import keep_confident, keep_range, without_speckles
 from vergence.info import ModelInfo, ServerInfo, StreamInfo
+from vergence.link import LinkState
 from vergence.reprojection import DepthView, View, reproject
 from vergence.results import (
     DepthResult,
@@ -96,6 +97,7 @@ __all__ = [
     "ImageEncoding",
     "InsufficientStorage",
     "Intrinsics",
+    "LinkState",
     "ModelChanged",
     "ModelFailed",
     "ModelInfo",

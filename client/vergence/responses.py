@@ -7,7 +7,7 @@ from dataclasses import fields
 from functools import partial
 
 from vergence.capture_clock import age_of
-from vergence.connection import RESET, Request
+from vergence.connection import RESET, FrameRequest, Request
 from vergence.in_flight import FrameInFlight, FramesInFlight
 from vergence.recent import RecentResults
 from vergence.results import DepthResult, Drops
@@ -27,7 +27,10 @@ class ResponseRouter:
 
     rig: RectifiedRig
 
-    def __init__(self, in_flight: FramesInFlight, axes: Axes, threads: Executor) -> None:
+    def __init__(
+        self, in_flight: FramesInFlight, axes: Axes, threads: Executor, *, paces: bool = False
+    ) -> None:
+        self._paces = paces  # the session paces its frames, so its credit is larger
         self.recent: RecentResults = RecentResults()
         self.opened: pb.StreamOpened | None = None  # None: the stream was never open
         self.error: Exception | None = None  # the error that ended the stream
@@ -58,13 +61,13 @@ class ResponseRouter:
 
     def request_of(self, frame: FrameInFlight) -> Request:
         """Return the frame's request; if its images must be encoded, a thread does it later."""
-        if isinstance(frame.request, bytes):
-            return frame.request
         encode = frame.request
 
         async def encoded() -> bytes | None:
             if frame.frame_id not in self._in_flight:  # it was given up meanwhile
                 return None
+            if isinstance(encode, bytes):
+                return encode
             loop = asyncio.get_running_loop()
             try:
                 return await loop.run_in_executor(self._threads, encode)
@@ -72,13 +75,14 @@ class ResponseRouter:
                 self._failed(frame.frame_id, error)
                 return None
 
-        return encoded
+        return FrameRequest(frame.frame_id, encoded)
 
     def attached(self, opened: pb.StreamOpened) -> list[Request]:
         """Record the open stream; return the requests that must be sent again."""
         self.opened = opened
         self.rig = codec.rectified_rig_from_proto(opened.rig)
-        self._in_flight.credit = max(opened.credit, 1)
+        paced = self._paces and opened.paced_credit
+        self._in_flight.credit = max(paced or opened.credit, 1)
         taken = ConnectionLost("the connection broke after the server took the frame")
         frames = self._in_flight.in_order()
         self._in_flight.fail((f for f in frames if f.frame_id <= opened.last_frame_id), taken)

@@ -21,6 +21,8 @@ class Drops:
 
     at_source: int = 0
     """Not sent: as many frames as the credit allows were unanswered."""
+    paced: int = 0
+    """Not sent: the link, or the server, was still busy with earlier frames."""
     offline: int = 0
     """Not sent: the connection was down, or silent."""
     displaced: int = 0
@@ -35,7 +37,8 @@ class Drops:
     @property
     def total(self) -> int:
         """The sum of all drops."""
-        return self.at_source + self.offline + self.displaced + self.stale + self.unread + self.lost
+        source = self.at_source + self.paced + self.offline
+        return source + self.displaced + self.stale + self.unread + self.lost
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,7 +100,10 @@ class NotSent(Enum):
     """The reason why :meth:`vergence.DepthSession.submit` did not send a frame. It is false."""
 
     CREDIT = "credit"
-    """As many frames as the credit allows are unanswered (``drops.at_source``)."""
+    """As many frames as the credit allows are unanswered, or an answer is late
+    (``drops.at_source``)."""
+    PACED = "paced"
+    """The link, or the server, is still busy with earlier frames (``drops.paced``)."""
     OFFLINE = "offline"
     """The connection is down or silent; see :attr:`vergence.DepthSession.state`."""
 

@@ -165,6 +165,11 @@ class DepthSession(SessionFacts):
         if not self._parts.in_flight.has_room:
             self._parts.in_flight.count(at_source=1)
             return NotSent.CREDIT
+        refusal = self._parts.link.refusal(len(self._parts.in_flight))
+        if refusal is not None:
+            paced = refusal is NotSent.PACED
+            self._parts.in_flight.count(**{"paced" if paced else "at_source": 1})
+            return refusal
         request = self._request(left, right, world_from_left, capture_ns, max_age_s)
         return self._send(request, answer=None)
 
@@ -283,10 +288,13 @@ class DepthSession(SessionFacts):
             world_from_left = PoseSample(world_from_left)
         capture_ns = self._clock.checked_ns(capture_ns)
         frame = StereoFrame(self._next_id, capture_ns, left, right, world_from_left)
-        setup = self._parts.setup
-        camera = setup.opening.rig.left
+        camera, link = self._parts.setup.opening.rig.left, self._parts.link
         return frame_request(
-            frame, setup.images, size=(camera.width, camera.height), max_age_s=max_age_s
+            frame,
+            link.images,
+            size=(camera.width, camera.height),
+            map_step=link.map_step,
+            max_age_s=max_age_s,
         )
 
     def _send(

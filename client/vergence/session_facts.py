@@ -10,10 +10,10 @@ import numpy as np
 from vergence.attaching import RecoveryRules
 from vergence.connection import StreamConnection
 from vergence.errors import NotOpen
-from vergence.image_format import ImageFormat
 from vergence.in_flight import FramesInFlight
 from vergence.info import ModelInfo
 from vergence.info_codec import model_info_from_proto
+from vergence.link import LinkRules, LinkState, SessionLink
 from vergence.reprojection import DepthView, Fill, View
 from vergence.responses import ResponseRouter
 from vergence.results import DepthResult, Drops, SessionEvent, SessionState
@@ -31,7 +31,7 @@ class SessionSetup:
     transport: Transport
     opening: pb.OpenStream
     delivery: Delivery
-    images: ImageFormat
+    link: LinkRules
     threads: Executor  # for work on whole images
     on_event: Callable[[SessionEvent], None] | None
     rules: RecoveryRules
@@ -45,16 +45,18 @@ class SessionParts:
     in_flight: FramesInFlight
     responses: ResponseRouter
     connection: StreamConnection
+    link: SessionLink
 
     @classmethod
     def of(cls, setup: SessionSetup) -> Self:
         in_flight = FramesInFlight()
         axes = codec.axes_from_proto(setup.opening.axes)
-        responses = ResponseRouter(in_flight, axes, setup.threads)
+        responses = ResponseRouter(in_flight, axes, setup.threads, paces=setup.link.adapts)
+        link = SessionLink(setup.link)
         connection = StreamConnection(
-            setup.transport, setup.opening, responses, setup.on_event, setup.rules
+            setup.transport, setup.opening, responses, setup.on_event, setup.rules, link
         )
-        return cls(setup, in_flight, responses, connection)
+        return cls(setup, in_flight, responses, connection, link)
 
     def opened(self) -> pb.StreamOpened:
         """Return how the server opened the stream. Raises NotOpen: it did not yet."""
@@ -112,6 +114,12 @@ class SessionFacts:
     def round_trip_s(self) -> float | None:
         """Network time in seconds, there and back, of the latest ping; None before the first."""
         return self._parts.connection.round_trip_s
+
+    @property
+    def link(self) -> LinkState:
+        """What the session measured of its link, what it chose, and what limits it."""
+        self._parts.opened()
+        return self._parts.link.state
 
     @property
     def state(self) -> SessionState:

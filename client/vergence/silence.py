@@ -33,6 +33,7 @@ class Silence:
     def begin(self) -> None:
         """Start with a new connection."""
         self._heard_s = self._looked_s = time.monotonic()
+        self._pinged_s = 0.0
         self._sent_bytes = 0
         self._arrived_bytes = 0
         self._sent_before: dict[int, int] = {}  # bytes sent before each ping without a pong
@@ -59,6 +60,16 @@ class Silence:
         return self.too_long and self.silent_s > wait_s
 
     @property
+    def ping_due(self) -> bool:
+        """Return True if the next frame should take a ping along."""
+        return time.monotonic() - self._pinged_s >= self.ping_interval_s / 2
+
+    @property
+    def ping_late(self) -> bool:
+        """Return True if a ping must be sent without a frame."""
+        return time.monotonic() - self._pinged_s >= 0.9 * self.ping_interval_s
+
+    @property
     def ping_interval_s(self) -> float:
         """Return the time between two pings: a session that is not in use needs fewer."""
         active = time.monotonic() - self._active_s < _ACTIVE_FOR_S
@@ -73,6 +84,7 @@ class Silence:
 
     def pinged(self, ping: pb.Ping) -> None:
         """Record a ping that is sent now."""
+        self._pinged_s = time.monotonic()
         self._sent_before[ping.client_ns] = self._sent_bytes
 
     def active(self) -> None:

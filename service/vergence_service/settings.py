@@ -152,6 +152,10 @@ class StreamSettings(_Section):
     credit: PositiveInt = Field(
         default=2, description="most frames that a client may send before an answer returns"
     )
+    paced_credit: PositiveInt = Field(
+        default=12,
+        description="the same for a live client that paces its frames by the link it measures",
+    )
     waiting_frames: PositiveInt = Field(
         default=8, description="frames of a lossless stream that wait before its sender must wait"
     )

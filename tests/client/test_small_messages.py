@@ -9,6 +9,7 @@ import pytest
 
 from tests.support.frames import RIG, make_frame
 from tests.support.models import RecallModel
+from tests.support.polling import eventually
 from tests.support.server import running_server
 from vergence import (
     BadImage,
@@ -17,10 +18,12 @@ from vergence import (
     DepthClient,
     DepthResult,
     ImageEncoding,
+    NotSent,
     OutputFormat,
     PlaneEncoding,
     Pose,
 )
+from vergence.link_control import UPLOADS
 from vergence_proto.types import StereoFrame
 from vergence_service.inference.model import Step, StepResult
 
@@ -116,3 +119,45 @@ async def test_the_images_are_copied_and_mistakes_are_reported_before_a_thread_e
         left[:] = right[:] = 0
         await anext(session)
     assert model.left.mean() > 10
+
+
+async def test_a_session_elsewhere_adapts_and_says_what_it_chose() -> None:
+    async with elsewhere(RecallModel()) as client:
+        frame = make_frame(1)
+        async with client.open_session(RIG) as session:
+            assert session.link.adapts
+            assert session.link.up_mbit_s is None
+            assert session.credit > 2
+            for _ in range(4):
+                await eventually(lambda: session.submit(frame.left, frame.right, frame.pose))
+                await anext(session)
+            link = session.link
+        async with client.open_session(RIG, jpeg_quality=33, link="fixed") as fixed:
+            assert (fixed.link.adapts, fixed.link.jpeg_quality, fixed.credit) == (False, 33, 2)
+    assert link.up_mbit_s is not None
+    assert link.server_s is not None
+    assert link.path_round_trip_s is not None
+    assert (link.jpeg_quality, link.scale) in {(each.jpeg_quality, each.scale) for each in UPLOADS}
+
+
+async def test_before_a_link_is_known_two_frames_are_sent() -> None:
+    model, frame = RecallModel(), make_frame(1)
+    async with elsewhere(model) as client, client.open_session(RIG) as session:
+        with model.busy():
+            sent = [session.submit(frame.left, frame.right, frame.pose) for _ in range(4)]
+        assert sent == [1, 2, NotSent.CREDIT, NotSent.CREDIT]
+        assert session.drops.at_source == 2
+
+
+async def test_what_a_caller_fixes_is_not_adapted() -> None:
+    frame = make_frame(1)
+    async with elsewhere(RecallModel()) as client:
+        output = OutputFormat(map_step=1)
+        async with client.open_session(RIG, jpeg_quality=95, output=output) as session:
+            for _ in range(6):
+                await eventually(lambda: session.submit(frame.left, frame.right, frame.pose))
+                result = await anext(session)
+            assert result.raw is not None
+            assert (session.link.jpeg_quality, result.raw.step) == (95, 1)
+        with pytest.raises(ValueError, match="'auto' or 'fixed'"):
+            client.open_session(RIG, link="slow")  # type: ignore[arg-type]

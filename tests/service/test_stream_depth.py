@@ -204,6 +204,40 @@ async def test_end_answers_what_was_sent_and_frees_the_stream() -> None:
             assert (await stub.GetServerInfo(pb.GetServerInfoRequest())).streams_open == 0
 
 
+async def test_answers_say_when_a_request_arrived_on_one_clock() -> None:
+    async with running_server(RecallModel()) as server, raw_stream(server) as call:
+        await call.send(pb.StreamDepthRequest(ping=pb.Ping(client_ns=1)))
+        await call.send(frame_message(make_frame(1)))
+        pong, answer = [await call.receive() for _ in range(2)]
+        await call.send(pb.StreamDepthRequest(ping=pb.Ping(client_ns=2)))
+        later = await call.receive()
+    assert pong is not None
+    assert answer is not None
+    assert later is not None
+    received = [
+        pong.pong.received_ns,
+        answer.disparity.received_ns,
+        answer.disparity.received_ns + answer.disparity.timings.total_us * 1000,
+        later.pong.received_ns,
+    ]
+    assert received == sorted(received)
+    assert received[0] > 0
+
+
+async def test_a_frame_may_ask_for_fewer_pixels_than_its_stream() -> None:
+    async with running_server(RecallModel()) as server, raw_stream(server) as call:
+        message = frame_message(make_frame(1))
+        message.frame.map_step = 4
+        small = await call.ask(message)
+        whole = await call.ask(frame_message(make_frame(2)))
+        message = frame_message(make_frame(3))
+        message.frame.map_step = 3
+        refused = await call.ask(message)
+    assert (small.disparity.map_step, small.disparity.disparity.width) == (4, RIG.width // 4)
+    assert (whole.disparity.map_step, whole.disparity.disparity.width) == (0, RIG.width)
+    assert "map_step" in refused.frame_error.message
+
+
 async def test_a_ping_reports_how_long_it_was_held() -> None:
     async with running_server(RecallModel()) as server, raw_stream(server) as call:
         answer = await call.ask(pb.StreamDepthRequest(ping=pb.Ping(client_ns=42)))

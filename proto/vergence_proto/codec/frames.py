@@ -65,11 +65,13 @@ def frame_to_request(
     encoding: ImageEncoding,
     jpeg_quality: int = 90,
     scale: int = 1,
+    map_step: int = 0,
     max_age_s: float | None = None,
 ) -> bytes:
     """Encode a pair as the bytes of a ``pb.StreamDepthRequest``; images are copied only once.
 
-    With ``scale`` 2 the images are sent at half size.
+    With ``scale`` 2 the images are sent at half size. ``map_step`` is that of the answer; 0: the
+    stream's.
 
     Raises BadImage: an image is not uint8 [H, W, 3] or [H, W], is empty, or does not fit its
     encoding.
@@ -78,6 +80,8 @@ def frame_to_request(
     message = pb.Frame(frame_id=frame.frame_id, capture_ns=frame.capture_ns, max_age_s=max_age_s)
     if scale != 1:
         message.scale = scale
+    if map_step:
+        message.map_step = map_step
     if frame.pose is not None:
         message.pose.CopyFrom(pose_sample_to_proto(frame.pose))
     pieces: list[Piece] = [message.SerializeToString()]
@@ -109,7 +113,8 @@ def check_frame(
 
     Raises FrameTooLarge: the images have more than ``max_bytes``, or far more than their pixels.
     Raises BadShape: the frame id is 0, the sizes differ from ``size``, reduced by the scale, or
-    from each other, the scale is not 1 or 2, or the maximum age is negative or not finite.
+    from each other, the scale is not 1 or 2, the map_step is not 1, 2 or 4, or the maximum age is
+    negative or not finite.
     """
     message = received.fields
     if message.frame_id == 0:
@@ -125,6 +130,7 @@ def check_frame(
     scale = message.scale or 1
     if scale not in FRAME_SCALES:
         raise BadShape(f"expected a scale of 1 or 2, got {scale}")
+    check_map_step(message.map_step or 1)
     if size is not None and (left.width, left.height) != (sent := reduced(size, scale)):
         reduction = "" if scale == 1 else f" at scale {scale}"
         raise BadShape(

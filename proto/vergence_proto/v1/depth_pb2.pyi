@@ -164,7 +164,7 @@ class OpenStream(_message.Message):
     def __init__(self, stream_id: _Optional[str] = ..., resume_token: _Optional[bytes] = ..., rig: _Optional[_Union[StereoRig, _Mapping[str, _Any]]] = ..., axes: _Optional[_Union[Axes, str]] = ..., delivery: _Optional[_Union[Delivery, str]] = ..., output: _Optional[_Union[OutputFormat, _Mapping[str, _Any]]] = ..., iterations: _Optional[int] = ..., cold_iterations: _Optional[int] = ..., weights_sha256: _Optional[str] = ..., opening_id: _Optional[bytes] = ...) -> None: ...
 
 class StreamOpened(_message.Message):
-    __slots__ = ("stream_id", "resume_token", "credit", "rig", "model", "resumed", "detach_grace_s", "idle_timeout_s", "last_frame_id", "silent_s", "max_frame_scale")
+    __slots__ = ("stream_id", "resume_token", "credit", "rig", "model", "resumed", "detach_grace_s", "idle_timeout_s", "last_frame_id", "silent_s", "max_frame_scale", "paced_credit")
     STREAM_ID_FIELD_NUMBER: _ClassVar[int]
     RESUME_TOKEN_FIELD_NUMBER: _ClassVar[int]
     CREDIT_FIELD_NUMBER: _ClassVar[int]
@@ -176,6 +176,7 @@ class StreamOpened(_message.Message):
     LAST_FRAME_ID_FIELD_NUMBER: _ClassVar[int]
     SILENT_S_FIELD_NUMBER: _ClassVar[int]
     MAX_FRAME_SCALE_FIELD_NUMBER: _ClassVar[int]
+    PACED_CREDIT_FIELD_NUMBER: _ClassVar[int]
     stream_id: str
     resume_token: bytes
     credit: int
@@ -187,10 +188,11 @@ class StreamOpened(_message.Message):
     last_frame_id: int
     silent_s: float
     max_frame_scale: int
-    def __init__(self, stream_id: _Optional[str] = ..., resume_token: _Optional[bytes] = ..., credit: _Optional[int] = ..., rig: _Optional[_Union[RectifiedRig, _Mapping[str, _Any]]] = ..., model: _Optional[_Union[ModelInfo, _Mapping[str, _Any]]] = ..., resumed: bool = ..., detach_grace_s: _Optional[float] = ..., idle_timeout_s: _Optional[float] = ..., last_frame_id: _Optional[int] = ..., silent_s: _Optional[float] = ..., max_frame_scale: _Optional[int] = ...) -> None: ...
+    paced_credit: int
+    def __init__(self, stream_id: _Optional[str] = ..., resume_token: _Optional[bytes] = ..., credit: _Optional[int] = ..., rig: _Optional[_Union[RectifiedRig, _Mapping[str, _Any]]] = ..., model: _Optional[_Union[ModelInfo, _Mapping[str, _Any]]] = ..., resumed: bool = ..., detach_grace_s: _Optional[float] = ..., idle_timeout_s: _Optional[float] = ..., last_frame_id: _Optional[int] = ..., silent_s: _Optional[float] = ..., max_frame_scale: _Optional[int] = ..., paced_credit: _Optional[int] = ...) -> None: ...
 
 class Frame(_message.Message):
-    __slots__ = ("frame_id", "capture_ns", "left", "right", "pose", "max_age_s", "scale")
+    __slots__ = ("frame_id", "capture_ns", "left", "right", "pose", "max_age_s", "scale", "map_step")
     FRAME_ID_FIELD_NUMBER: _ClassVar[int]
     CAPTURE_NS_FIELD_NUMBER: _ClassVar[int]
     LEFT_FIELD_NUMBER: _ClassVar[int]
@@ -198,6 +200,7 @@ class Frame(_message.Message):
     POSE_FIELD_NUMBER: _ClassVar[int]
     MAX_AGE_S_FIELD_NUMBER: _ClassVar[int]
     SCALE_FIELD_NUMBER: _ClassVar[int]
+    MAP_STEP_FIELD_NUMBER: _ClassVar[int]
     frame_id: int
     capture_ns: int
     left: Image
@@ -205,7 +208,8 @@ class Frame(_message.Message):
     pose: PoseSample
     max_age_s: float
     scale: int
-    def __init__(self, frame_id: _Optional[int] = ..., capture_ns: _Optional[int] = ..., left: _Optional[_Union[Image, _Mapping[str, _Any]]] = ..., right: _Optional[_Union[Image, _Mapping[str, _Any]]] = ..., pose: _Optional[_Union[PoseSample, _Mapping[str, _Any]]] = ..., max_age_s: _Optional[float] = ..., scale: _Optional[int] = ...) -> None: ...
+    map_step: int
+    def __init__(self, frame_id: _Optional[int] = ..., capture_ns: _Optional[int] = ..., left: _Optional[_Union[Image, _Mapping[str, _Any]]] = ..., right: _Optional[_Union[Image, _Mapping[str, _Any]]] = ..., pose: _Optional[_Union[PoseSample, _Mapping[str, _Any]]] = ..., max_age_s: _Optional[float] = ..., scale: _Optional[int] = ..., map_step: _Optional[int] = ...) -> None: ...
 
 class Reset(_message.Message):
     __slots__ = ()
@@ -222,14 +226,16 @@ class Ping(_message.Message):
     def __init__(self, client_ns: _Optional[int] = ...) -> None: ...
 
 class Pong(_message.Message):
-    __slots__ = ("client_ns", "server_hold_ns", "unanswered_frame_ids")
+    __slots__ = ("client_ns", "server_hold_ns", "unanswered_frame_ids", "received_ns")
     CLIENT_NS_FIELD_NUMBER: _ClassVar[int]
     SERVER_HOLD_NS_FIELD_NUMBER: _ClassVar[int]
     UNANSWERED_FRAME_IDS_FIELD_NUMBER: _ClassVar[int]
+    RECEIVED_NS_FIELD_NUMBER: _ClassVar[int]
     client_ns: int
     server_hold_ns: int
     unanswered_frame_ids: _containers.RepeatedScalarFieldContainer[int]
-    def __init__(self, client_ns: _Optional[int] = ..., server_hold_ns: _Optional[int] = ..., unanswered_frame_ids: _Optional[_Iterable[int]] = ...) -> None: ...
+    received_ns: int
+    def __init__(self, client_ns: _Optional[int] = ..., server_hold_ns: _Optional[int] = ..., unanswered_frame_ids: _Optional[_Iterable[int]] = ..., received_ns: _Optional[int] = ...) -> None: ...
 
 class Notice(_message.Message):
     __slots__ = ("kind", "message", "in_s")
@@ -260,7 +266,7 @@ class FramesDropped(_message.Message):
     def __init__(self, frame_ids: _Optional[_Iterable[int]] = ...) -> None: ...
 
 class DisparityMap(_message.Message):
-    __slots__ = ("frame_id", "capture_ns", "disparity", "confidence", "sigma", "world_from_left", "origin", "step_count", "iterations", "frames_skipped", "timings", "max_disparity_px", "map_step")
+    __slots__ = ("frame_id", "capture_ns", "disparity", "confidence", "sigma", "world_from_left", "origin", "step_count", "iterations", "frames_skipped", "timings", "max_disparity_px", "map_step", "received_ns")
     FRAME_ID_FIELD_NUMBER: _ClassVar[int]
     CAPTURE_NS_FIELD_NUMBER: _ClassVar[int]
     DISPARITY_FIELD_NUMBER: _ClassVar[int]
@@ -274,6 +280,7 @@ class DisparityMap(_message.Message):
     TIMINGS_FIELD_NUMBER: _ClassVar[int]
     MAX_DISPARITY_PX_FIELD_NUMBER: _ClassVar[int]
     MAP_STEP_FIELD_NUMBER: _ClassVar[int]
+    RECEIVED_NS_FIELD_NUMBER: _ClassVar[int]
     frame_id: int
     capture_ns: int
     disparity: Plane
@@ -287,7 +294,8 @@ class DisparityMap(_message.Message):
     timings: Timings
     max_disparity_px: float
     map_step: int
-    def __init__(self, frame_id: _Optional[int] = ..., capture_ns: _Optional[int] = ..., disparity: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., confidence: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., sigma: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., world_from_left: _Optional[_Union[Pose, _Mapping[str, _Any]]] = ..., origin: _Optional[_Union[Origin, str]] = ..., step_count: _Optional[int] = ..., iterations: _Optional[int] = ..., frames_skipped: _Optional[int] = ..., timings: _Optional[_Union[Timings, _Mapping[str, _Any]]] = ..., max_disparity_px: _Optional[float] = ..., map_step: _Optional[int] = ...) -> None: ...
+    received_ns: int
+    def __init__(self, frame_id: _Optional[int] = ..., capture_ns: _Optional[int] = ..., disparity: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., confidence: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., sigma: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., world_from_left: _Optional[_Union[Pose, _Mapping[str, _Any]]] = ..., origin: _Optional[_Union[Origin, str]] = ..., step_count: _Optional[int] = ..., iterations: _Optional[int] = ..., frames_skipped: _Optional[int] = ..., timings: _Optional[_Union[Timings, _Mapping[str, _Any]]] = ..., max_disparity_px: _Optional[float] = ..., map_step: _Optional[int] = ..., received_ns: _Optional[int] = ...) -> None: ...
 
 class Timings(_message.Message):
     __slots__ = ("decode_us", "queue_us", "model_us", "encode_us", "total_us")

@@ -131,6 +131,7 @@ async def running(
     max_frame_bytes = settings.limits.max_frame_mib * _MIB
     limits = StreamLimits(
         credit=settings.streams.credit,
+        paced_credit=max(settings.streams.paced_credit, settings.streams.credit),
         waiting_frames=settings.streams.waiting_frames,
         max_frame_bytes=max_frame_bytes,
         silent_s=settings.limits.silent_s,

@@ -24,6 +24,12 @@ _NOTICE = {
 }
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Map:
+    stepped: SteppedFrame
+    map_step: int  # 0: the stream's
+
+
 @dataclass(frozen=True, slots=True)
 class _Ping:
     client_ns: int
@@ -45,7 +51,7 @@ class Outbox:
         self._threads = threads
         self._clock = clock
         self._metrics = metrics
-        self._answers: asyncio.Queue[pb.StreamDepthResponse | SteppedFrame | _Ping | None]
+        self._answers: asyncio.Queue[pb.StreamDepthResponse | _Map | _Ping | None]
         self._answers = asyncio.Queue(_ROOM)
         self._unsent = asyncio.Semaphore(_UNSENT_MAPS)
 
@@ -71,9 +77,9 @@ class Outbox:
         """Return the room that was reserved, because the frame failed."""
         self._unsent.release()
 
-    async def put_map(self, stepped: SteppedFrame) -> None:
-        """Add a map, in the room that was reserved."""
-        await self._answers.put(stepped)
+    async def put_map(self, stepped: SteppedFrame, *, map_step: int = 0) -> None:
+        """Add a map, in the room that was reserved. ``map_step`` 0: as the stream was opened."""
+        await self._answers.put(_Map(stepped, map_step))
 
     async def finish(self) -> None:
         """Accept no more answers."""
@@ -83,29 +89,35 @@ class Outbox:
         """Write answers as they come, until the outbox is finished and empty."""
         while (answer := await self._answers.get()) is not None:
             match answer:
-                case SteppedFrame():
-                    await self._write(await self._threads.run(self._encoded, answer))
+                case _Map(stepped, map_step):
+                    await self._write(await self._threads.run(self._encoded, stepped, map_step))
                     self._unsent.release()
                 case _Ping(client_ns, arrived_s):
                     hold_ns = int((self._clock() - arrived_s) * 1e9)
-                    pong = pb.Pong(client_ns=client_ns, server_hold_ns=hold_ns)
+                    pong = pb.Pong(
+                        client_ns=client_ns,
+                        server_hold_ns=hold_ns,
+                        received_ns=int(arrived_s * 1e9),
+                    )
                     await self._write(pb.StreamDepthResponse(pong=pong))
                 case _:
                     await self._write(answer)
 
-    def _encoded(self, stepped: SteppedFrame) -> pb.StreamDepthResponse:
+    def _encoded(self, stepped: SteppedFrame, map_step: int) -> pb.StreamDepthResponse:
         try:
-            return self._encoded_map(stepped)
+            return self._encoded_map(stepped, map_step)
         except MemoryError:
             error = codec.error_to_frame_error(stepped.frame_id, out_of_memory())
             return pb.StreamDepthResponse(frame_error=error)
 
-    def _encoded_map(self, stepped: SteppedFrame) -> pb.StreamDepthResponse:
+    def _encoded_map(self, stepped: SteppedFrame, map_step: int) -> pb.StreamDepthResponse:
         started_s = self._clock()
         response = pb.StreamDepthResponse()
-        message = codec.disparity_to_proto(
-            stepped.disparity_map(), stepped.stream.config.output, into=response.disparity
-        )
+        output = stepped.stream.config.output
+        if map_step:
+            output = replace(output, map_step=map_step)
+        message = codec.disparity_to_proto(stepped.disparity_map(), output, into=response.disparity)
+        message.received_ns = int(stepped.arrived_s * 1e9)
         now_s = self._clock()
         timings = replace(
             stepped.timings, encode_s=now_s - started_s, total_s=now_s - stepped.arrived_s

@@ -26,6 +26,7 @@ class StreamLimits:
     """The limits of one call."""
 
     credit: int  # most frames that a client may send before an answer returns
+    paced_credit: int  # the same for a live client that paces them by the link
     waiting_frames: int  # frames of a lossless stream that wait before the sender must wait
     max_frame_bytes: int
     silent_s: float  # a client that pinged and sends nothing for this long counts as lost
@@ -216,7 +217,12 @@ class DepthCall:
             last_frame_id=stream.last_frame_id,
             silent_s=self._limits.silent_s,
             max_frame_scale=codec.MAX_FRAME_SCALE,
+            paced_credit=self._most_unanswered(stream),
         )
+
+    def _most_unanswered(self, stream: Stream) -> int:
+        live = stream.config.delivery is Delivery.NEWEST
+        return self._limits.paced_credit if live else self._limits.credit
 
     async def _read(self, stream: Stream, mailbox: Mailbox) -> None:
         try:
@@ -244,7 +250,7 @@ class DepthCall:
         self, stream: Stream, mailbox: Mailbox, frame: codec.ReceivedFrame, arrived_s: float
     ) -> None:
         self._owed += 1
-        self._overran = self._overran or self._owed > self._limits.credit
+        self._overran = self._overran or self._owed > self._most_unanswered(stream)
         rig = stream.rectifier.rig
         try:
             codec.check_frame(
@@ -303,7 +309,7 @@ class DepthCall:
                 self._outbox.release_map()
                 await self._refuse(queued.frame_id, error)
             else:
-                await self._outbox.put_map(stepped)
+                await self._outbox.put_map(stepped, map_step=fields.map_step)
                 self._answered()
             finally:
                 queued.memory.release()

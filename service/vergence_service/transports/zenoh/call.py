@@ -94,8 +94,10 @@ class ZenohCall:
     async def _note(self, frame_id: int) -> None:
         last = self._last_frame_id
         if last is not None:
-            # At most ``credit`` frames of a client wait for an answer, so no more can be missing.
-            oldest = max(last + 1, frame_id - self._calls.limits.credit)
+            # No more frames of a client wait for an answer, so no more can be missing.
+            limits = self._calls.limits
+            most = limits.paced_credit if self._live else limits.credit
+            oldest = max(last + 1, frame_id - most)
             await self._call.report_lost(range(oldest, frame_id))
         self._last_frame_id = frame_id
         self._unanswered.add(frame_id)
