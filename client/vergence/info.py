@@ -17,6 +17,8 @@ class ModelInfo:
     """The largest disparity that the model searches, in pixels of images up to 1280 px wide.
 
     A result states its own range as ``max_disparity_px``."""
+    recurrent: bool = True
+    """The model remembers past frames. False: every frame is a cold start, and poses are unused."""
 
 
 @dataclass(frozen=True, slots=True)

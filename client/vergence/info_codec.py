@@ -7,7 +7,13 @@ from vergence_proto.v1 import depth_pb2 as pb
 def model_info_from_proto(message: pb.ModelInfo) -> ModelInfo:
     """Convert the description of a model."""
     iterations = tuple(message.iterations)
-    return ModelInfo(message.name, message.weights_sha256, iterations, message.max_disparity_px)
+    return ModelInfo(
+        name=message.name,
+        weights_sha256=message.weights_sha256,
+        iterations=iterations,
+        max_disparity_px=message.max_disparity_px,
+        recurrent=message.recurrent or not message.HasField("recurrent"),  # absent: older server
+    )
 
 
 def server_info_from_proto(message: pb.GetServerInfoResponse) -> ServerInfo:

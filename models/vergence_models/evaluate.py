@@ -55,6 +55,8 @@ Results = dict[str, dict[str, MetricAccumulator]]  # group -> method -> its figu
 def methods_for(network: SteppedNetwork, *, thorough: bool) -> list[Method]:
     """The network warm and cold, and SGBM; ``thorough`` adds no motion and noisy motion."""
     name, most = network.card.name, max(network.card.graphs)
+    if not network.card.recurrent:  # poses do not matter to it either
+        return [single_frame_method(network, name, most), *sgbm_methods()]
     warm = warm_method(network, name, 1, cold=most)
     methods = [warm, single_frame_method(network, name, most)]
     if thorough:

@@ -10,6 +10,8 @@ per count: one stage of one graph.
 A model may have separate graphs for cold starts. They are used when there is no state, for the
 iteration counts listed, up to their maximum image size.
 
+A model may have no state tensors. Then every frame is a cold start, and its graphs need no motion.
+
 Inputs:
 
 - ``left``, ``right``: uint8 [B, H, W, 3], rectified RGB; H and W as :meth:`ModelCard.step_size`.
@@ -98,6 +100,11 @@ class ModelCard:
         if cold_pixels is None or cold_pixels > self.cold_max_pixels:
             return usual
         return self.cold_graphs.get(iterations, usual)
+
+    @property
+    def recurrent(self) -> bool:
+        """True if a step passes a state to the next. False: every frame is a cold start."""
+        return bool(self.state)
 
     @property
     def all_stages(self) -> tuple[Stage, ...]:

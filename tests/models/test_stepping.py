@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from tests.support.weights_copy import WEIGHTS, Entry, copied_weights
-from vergence_models.evaluation.stepping import OnnxNetwork, StepInputs
+from vergence_models.evaluation.stepping import Footage, FootageView, OnnxNetwork, StepInputs
+from vergence_proto.geometry import Pose, RectifiedRig
 
 HEIGHT, WIDTH = 40, 70
 
@@ -41,3 +42,19 @@ def test_a_start_runs_the_cold_graphs(tmp_path: Path) -> None:
     )
     np.testing.assert_array_equal(started[0], twice[0])
     assert not np.array_equal(started[0], once[0])
+
+
+def test_without_memory_a_sequence_is_a_row_of_single_frames() -> None:
+    network = OnnxNetwork(WEIGHTS, "matcher")
+    random = np.random.default_rng(3)
+    poses = [Pose(np.eye(3), np.array([0.1 * i, 0.0, 0.0])) for i in range(3)]
+    views = []
+    for i, pose in enumerate(poses):
+        left = random.integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
+        views.append(FootageView(left, np.roll(left, -2 - i, axis=1), pose))
+    rig = RectifiedRig(WIDTH, HEIGHT, 60.0, 60.0, 34.5, 34.5, 19.5, 0.1)
+    predicted = [*network.sequence(Footage("three", rig, views), cold=1, warm=1)]
+    for i, (view, each) in enumerate(zip(views, predicted, strict=True)):
+        alone = network.start(view.left[None], view.right[None], 1)
+        np.testing.assert_array_equal(each.disparity_px, alone.disparity_px[0])
+        assert np.median(each.disparity_px[5:-5, 16:]) == 2 + i

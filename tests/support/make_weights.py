@@ -6,6 +6,7 @@ that the suite needs no more than the server does.
 - ``reciprocal`` divides by brightness: not finite where a pixel of the left image is black.
 - ``whole`` remembers, and fails where a pixel of either image is white: one graph per count.
 - ``staged`` does the same, operation by operation, in three graphs of two stages.
+- ``matcher`` has no memory: it compares blocks of the two images.
 """
 
 import hashlib
@@ -17,11 +18,13 @@ import numpy as np
 import onnx
 from onnx import NodeProto, TensorProto, helper, numpy_helper
 
+from tests.support.block_matcher import brightness_of, matching
 from vergence_proto.model_io import DISPARITY, LEFT, MANIFEST_FORMAT, MANIFEST_NAME, RIGHT, SIGMA
 from vergence_proto.model_io import UVD_CURR_FROM_PREV as MOTION
 
 FOLDER = Path(__file__).parent / "weights"
 COUNTS = (1, 2)
+MATCHER_DISPARITIES = 16
 
 Shape = list[str | int | None]
 _IMAGE: tuple[int, Shape] = (TensorProto.UINT8, ["B", "H", "W", 3])
@@ -84,8 +87,33 @@ def recall(iterations: int) -> list[NodeProto]:
     return [*nodes, helper.make_node("Unsqueeze", [DISPARITY, "first"], ["next_memory"])]
 
 
+def matcher() -> tuple[list[NodeProto], list[TensorProto]]:
+    """disparity = that of the most similar block; sigma = 0.5 px everywhere."""
+    light, light_constants = brightness_of([LEFT, RIGHT])
+    search, constants = matching(
+        f"{LEFT}_light", f"{RIGHT}_light", "found", disparities=MATCHER_DISPARITIES
+    )
+    nodes = [
+        *light,
+        *search,
+        helper.make_node("Squeeze", ["found", "first"], [DISPARITY]),
+        helper.make_node("Mul", [DISPARITY, "nothing"], ["zeros"]),
+        helper.make_node("Add", ["zeros", "half"], [SIGMA]),
+    ]
+    numbers = {"nothing": np.float32(0), "half": np.float32(0.5)}
+    return nodes, [
+        *light_constants,
+        *constants,
+        *(numpy_helper.from_array(np.array(value), name) for name, value in numbers.items()),
+    ]
+
+
 def write_graph(
-    name: str, nodes: list[NodeProto], inputs: Sequence[str], outputs: Sequence[str]
+    name: str,
+    nodes: list[NodeProto],
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    own_constants: Sequence[TensorProto] = (),
 ) -> str:
     """Write a graph to the folder; returns its file's name."""
     constants = [
@@ -93,6 +121,7 @@ def write_graph(
         helper.make_tensor("first", TensorProto.INT64, [1], [1]),
         helper.make_tensor("matrix", TensorProto.INT64, [2], [1, 2]),
         numpy_helper.from_array(_LIGHT, "light"),
+        *own_constants,
     ]
     used = {tensor for node in nodes for tensor in node.input}
     graph = helper.make_graph(
@@ -109,13 +138,15 @@ def write_graph(
     return f"{name}.onnx"
 
 
-def entry(graphs: dict[int, list[list[str]]]) -> dict[str, object]:
+def entry(
+    graphs: dict[int, list[list[str]]], *, memory: bool = True, max_disparity_px: int = 64
+) -> dict[str, object]:
     files = sorted({file for stages in graphs.values() for stage in stages for file in stage})
     digests = {file: hashlib.sha256((FOLDER / file).read_bytes()).hexdigest() for file in files}
     return {
         "stride": 1,
-        "max_disparity_px": 64,
-        "state": [{"name": "memory", "channels": 1, "scale": 1}],
+        "max_disparity_px": max_disparity_px,
+        "state": [{"name": "memory", "channels": 1, "scale": 1}] if memory else [],
         "graphs": {str(count): stages for count, stages in graphs.items()},
         "files": digests,
     }
@@ -137,7 +168,10 @@ def main() -> None:
         last_outputs = [DISPARITY, "next_memory"]
         last = write_graph(f"staged_{count}", last_nodes, last_inputs, last_outputs)
         staged[count] = [first_stage, [last]]
+    nodes, constants = matcher()
+    blocks = write_graph("matcher_1", nodes, [LEFT, RIGHT], [DISPARITY, SIGMA], constants)
     models = {
+        "matcher": entry({1: [[blocks]]}, memory=False, max_disparity_px=MATCHER_DISPARITIES),
         "reciprocal": entry({1: [[only]]}),
         "whole": entry(whole),
         "staged": entry(staged),

@@ -138,12 +138,12 @@ class SteppedNetwork(ABC):
 
         ``warm=None`` carries no state: every frame starts cold. No pose is no motion.
         """
-        state: State | None = None
+        state: State = ()  # also of a model without memory: each of its frames is a cold start
         previous: Pose | None = None
         for view in footage.views:
             height, width = view.left.shape[:2]
             left, right = (self.card.grown(image)[None] for image in (view.left, view.right))
-            if state is None or warm is None:
+            if not state or warm is None:
                 disparity, sigma, state = self.start(left, right, cold)
             else:
                 matrix = NO_MOTION

@@ -97,10 +97,10 @@ def exported(folder: Path, *, threads: int) -> list[StudiedNetwork]:
                 name,
                 network,
                 TrainingSummary.of(name, "onnxruntime", entry.get("training", {})),
-                warm=tuple(n for n in WARM if n in counts),
+                warm=tuple(n for n in WARM if n in counts) if network.card.recurrent else (),
                 single_frame=tuple(n for n in SINGLE_FRAME if n in counts) or (max(counts),),
                 cold=network.card.iterations_at_most(COLD),
-                warps=entry.get("architecture", {}).get("warp", True),
+                warps=network.card.recurrent and entry.get("architecture", {}).get("warp", True),
             )
         )
     return found

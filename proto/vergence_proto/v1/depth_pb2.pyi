@@ -448,16 +448,18 @@ class RectifiedRig(_message.Message):
     def __init__(self, width: _Optional[int] = ..., height: _Optional[int] = ..., fx: _Optional[float] = ..., fy: _Optional[float] = ..., cx_left: _Optional[float] = ..., cx_right: _Optional[float] = ..., cy: _Optional[float] = ..., baseline_m: _Optional[float] = ...) -> None: ...
 
 class ModelInfo(_message.Message):
-    __slots__ = ("name", "weights_sha256", "iterations", "max_disparity_px")
+    __slots__ = ("name", "weights_sha256", "iterations", "max_disparity_px", "recurrent")
     NAME_FIELD_NUMBER: _ClassVar[int]
     WEIGHTS_SHA256_FIELD_NUMBER: _ClassVar[int]
     ITERATIONS_FIELD_NUMBER: _ClassVar[int]
     MAX_DISPARITY_PX_FIELD_NUMBER: _ClassVar[int]
+    RECURRENT_FIELD_NUMBER: _ClassVar[int]
     name: str
     weights_sha256: str
     iterations: _containers.RepeatedScalarFieldContainer[int]
     max_disparity_px: int
-    def __init__(self, name: _Optional[str] = ..., weights_sha256: _Optional[str] = ..., iterations: _Optional[_Iterable[int]] = ..., max_disparity_px: _Optional[int] = ...) -> None: ...
+    recurrent: bool
+    def __init__(self, name: _Optional[str] = ..., weights_sha256: _Optional[str] = ..., iterations: _Optional[_Iterable[int]] = ..., max_disparity_px: _Optional[int] = ..., recurrent: bool = ...) -> None: ...
 
 class GetServerInfoRequest(_message.Message):
     __slots__ = ()

@@ -185,7 +185,7 @@ def _batch_on_host(tensor: Tensor) -> NDArray[np.float32]:
 
 def _rows(tensors: Sequence[Tensor], count: int) -> list[tuple[Tensor, ...]]:
     """Split a batch of states into rows. A single row stays on its device, several are copied."""
-    if count == 1 and isinstance(tensors[0], DeviceTensor):
+    if count == 1 and any(isinstance(tensor, DeviceTensor) for tensor in tensors):
         return [tuple(tensors)]
     batches = [*map(_batch_on_host, tensors)]
     return [tuple(batch[row] for batch in batches) for row in range(count)]

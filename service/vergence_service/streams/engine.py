@@ -240,6 +240,8 @@ class DepthEngine:
         need = await self._check_opening(config)
         with await self.memory.wait_for_stream(need) as memory:
             rectifier = await self._rectifier(config.rig)
+            if not self.card.recurrent:
+                state = None
             origin = Origin.COLD_START if state is None else Origin.WARM
             yield Stream(
                 "",
@@ -272,7 +274,7 @@ class DepthEngine:
         """Let later frames start without a state. Raises UnknownStream, StreamExpired."""
         stream = self.streams.get(stream_id, owner=owner)
         async with stream.turn:
-            stream.forget(Origin.RESET_REQUESTED)
+            self._forget(stream, Origin.RESET_REQUESTED)
 
     def count_dropped(self, stream: Stream) -> None:
         """Count a frame that a newer frame displaced."""
@@ -373,7 +375,7 @@ class DepthEngine:
             except DepthError as error:
                 self.count_failed(stream, error)
                 if isinstance(error, NonFinite):
-                    stream.forget(Origin.RESET_NON_FINITE)
+                    self._forget(stream, Origin.RESET_NON_FINITE)
                 raise
             stream.commit(frame.frame_id, result.state, frames_skipped=skipped)
         self.metrics.frames_stepped.labels(origin.name.lower()).inc()
@@ -382,6 +384,10 @@ class DepthEngine:
         return SteppedFrame(
             stream, frame.frame_id, arrived_s, view, result, origin, iterations, skipped, timings
         )
+
+    def _forget(self, stream: Stream, reason: Origin) -> None:
+        """Discard the stream's state. A model without memory has none, so it has no reason."""
+        stream.forget(reason if self.card.recurrent else Origin.COLD_START)
 
     def _iterations_of(self, config: StreamConfig, *, cold: bool) -> int:
         wanted = (

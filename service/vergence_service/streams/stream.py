@@ -123,8 +123,9 @@ class Stream:
 
     def commit(self, frame_id: int, state: RecurrentState, *, frames_skipped: int) -> None:
         """Record that ``frame_id`` was stepped, ``frames_skipped`` frames after the one before."""
-        self.state = state
-        self.origin = Origin.WARM
+        if state.tensors:
+            self.state, self.origin = state, Origin.WARM
+        # Otherwise the model has no memory, and the next frame is a cold start as well.
         self.last_frame_id = frame_id
         self.frames_stepped += 1
         # Frames that were dropped while this one was in the model count for the next.

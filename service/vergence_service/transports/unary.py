@@ -96,4 +96,5 @@ def model_info(card: ModelCard) -> pb.ModelInfo:
         weights_sha256=card.weights_sha256,
         iterations=sorted(card.graphs),
         max_disparity_px=card.max_disparity_px,
+        recurrent=card.recurrent,
     )
