@@ -2,14 +2,17 @@
 
 import asyncio
 from collections import deque
+from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import fields
 from functools import partial
+from typing import TypeVar
 
 from vergence.capture_clock import age_of
 from vergence.connection import RESET, FrameRequest, Request
 from vergence.in_flight import FrameInFlight, FramesInFlight
 from vergence.recent import RecentResults
+from vergence.recording import SessionRecording
 from vergence.results import DepthResult, Drops
 from vergence.transports.base import ConnectionLost
 from vergence_proto import codec
@@ -17,6 +20,8 @@ from vergence_proto.errors import DepthError, FrameStale
 from vergence_proto.geometry import Axes, RectifiedRig
 from vergence_proto.types import DisparityMap, ReceivedPlanes
 from vergence_proto.v1 import depth_pb2 as pb
+
+Value = TypeVar("Value")
 
 
 class ResponseRouter:
@@ -35,6 +40,7 @@ class ResponseRouter:
         self.opened: pb.StreamOpened | None = None  # None: the stream was never open
         self.error: Exception | None = None  # the error that ended the stream
         self.reset_after: int | None = None  # the last frame before a reset not yet confirmed
+        self.recording: SessionRecording | None = None
         self._in_flight = in_flight
         self._axes = axes
         self._threads = threads
@@ -66,14 +72,14 @@ class ResponseRouter:
         async def encoded() -> bytes | None:
             if frame.frame_id not in self._in_flight:  # it was given up meanwhile
                 return None
-            if isinstance(encode, bytes):
-                return encode
-            loop = asyncio.get_running_loop()
             try:
-                return await loop.run_in_executor(self._threads, encode)
+                request = encode if isinstance(encode, bytes) else await self._in_thread(encode)
             except DepthError as error:
                 self._failed(frame.frame_id, error)
                 return None
+            if self.recording is not None:
+                self.recording.sent(frame.frame_id, request)
+            return request
 
         return FrameRequest(frame.frame_id, encoded)
 
@@ -124,11 +130,7 @@ class ResponseRouter:
         work = partial(_decoded, message, self.rig)
         plain = message.disparity.compression == pb.COMPRESSION_NONE and message.map_step <= 1
         try:
-            if plain:
-                disparity_map, raw = work()
-            else:
-                loop = asyncio.get_running_loop()
-                disparity_map, raw = await loop.run_in_executor(self._threads, work)
+            disparity_map, raw = work() if plain else await self._in_thread(work)
         except DepthError as error:  # a damaged answer fails its own frame only
             self._failed(message.frame_id, error)
             return
@@ -138,13 +140,20 @@ class ResponseRouter:
         )
         if frame is None:
             return
+        if self.recording is not None:
+            self.recording.answered(message, result)
         self.recent.add(result)
         if frame.answer is None:
             self._deliver(result)
         elif not frame.answer.done():  # done: the caller was cancelled
             frame.answer.set_result(result)
 
+    async def _in_thread(self, work: Callable[[], Value]) -> Value:
+        return await asyncio.get_running_loop().run_in_executor(self._threads, work)
+
     def _failed(self, frame_id: int, error: DepthError) -> None:
+        if self.recording is not None:
+            self.recording.unanswered(frame_id)
         frame = self._in_flight.pop(frame_id)
         if frame is None:
             return
@@ -156,6 +165,8 @@ class ResponseRouter:
             self._deliver(error)
 
     def _dropped(self, frame_id: int) -> None:
+        if self.recording is not None:
+            self.recording.unanswered(frame_id)
         frame = self._in_flight.pop(frame_id)
         if frame is None:
             return

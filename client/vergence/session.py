@@ -101,6 +101,8 @@ class DepthSession(SessionFacts):
         """End the stream; the server frees its state."""
         self._left_open = False
         await self._parts.connection.close()
+        if self._parts.responses.recording is not None:
+            await asyncio.to_thread(self._parts.responses.recording.close)
 
     def __del__(self) -> None:
         """Warn if nobody has left the ``async with`` (or ``with``) of this session."""

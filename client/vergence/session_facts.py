@@ -1,8 +1,10 @@
 """What a session knows of its stream, the same for asynchronous and blocking callers."""
 
+import os
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Self
 
 import numpy as np
@@ -14,6 +16,7 @@ from vergence.in_flight import FramesInFlight
 from vergence.info import ModelInfo
 from vergence.info_codec import model_info_from_proto
 from vergence.link import LinkRules, LinkState, SessionLink
+from vergence.recording import SessionRecording
 from vergence.reprojection import DepthView, Fill, View
 from vergence.responses import ResponseRouter
 from vergence.results import DepthResult, Drops, SessionEvent, SessionState
@@ -131,6 +134,36 @@ class SessionFacts:
     def latest(self) -> DepthResult | None:
         """The newest result so far; None before the first. Any thread may read it, at any time."""
         return self._parts.responses.recent.latest
+
+    def record(self, path: str | os.PathLike[str]) -> SessionRecording:
+        """Record the frames that are answered from now on, with their results, into an MCAP file.
+
+        Foxglove and other viewers open the file. ``vergence run mcap:FILE`` replays it, and gives
+        the same results, bit for bit, if it was recorded from the stream's first frame on. The
+        recording ends with its ``with`` block or with the session.
+
+        Parameters
+        ----------
+        path
+            The file to write; one that is there is replaced.
+
+        Raises
+        ------
+        NotOpen
+            The session is not open.
+        ImportError
+            The packages of the extra ``record`` are not installed.
+        OSError
+            The file cannot be written.
+        RuntimeError
+            The session is being recorded already.
+        """
+        opened = self._parts.opened()
+        responses = self._parts.responses
+        if responses.recording is not None and responses.recording.is_open:
+            raise RuntimeError("this session is being recorded; close that recording first")
+        responses.recording = SessionRecording(Path(path), self._parts.setup.opening, opened)
+        return responses.recording
 
     def depth_at(
         self,

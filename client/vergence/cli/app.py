@@ -34,6 +34,23 @@ JsonOption = Annotated[
     Path | None, typer.Option("--json", help="Write the figures of the table to this file.")
 ]
 
+CalibOption = Annotated[
+    Path | None,
+    typer.Option(help="Calibration of images or a camera, as vergence calib reads it."),
+]
+FocalLengthOption = Annotated[
+    float | None, typer.Option("--fx", min=0, help="Focal length of rectified images, in pixels.")
+]
+BaselineOption = Annotated[
+    float | None, typer.Option("--baseline", min=0, help="Distance of the two cameras, in metres.")
+]
+RateOption = Annotated[
+    str,
+    typer.Option(
+        "--rate", help="max: every frame, losslessly. HZ or source: live, newest frames win."
+    ),
+]
+
 
 def _await(work: Coroutine[Any, Any, Value]) -> Value:
     from vergence.cli.ending import run_until_stopped
@@ -73,6 +90,16 @@ def _checked_server(server: str | None) -> str | None:
         except ValueError as error:
             raise typer.BadParameter(str(error)) from None
     return server
+
+
+ServerOption = Annotated[
+    str | None,
+    typer.Option(
+        "--server",
+        help="HOST:PORT or zenoh://HOST:PORT of a running server; default: start one.",
+        callback=_checked_server,
+    ),
+]
 
 
 @app.callback()
@@ -138,30 +165,14 @@ def _run(
             "video, or camera:0.",
         ),
     ],
-    calib: Annotated[
-        Path | None,
-        typer.Option(help="Calibration of images or a camera, as vergence calib reads it."),
-    ] = None,
-    fx: Annotated[
-        float | None, typer.Option(min=0, help="Focal length of rectified images, in pixels.")
-    ] = None,
-    baseline: Annotated[
-        float | None, typer.Option(min=0, help="Distance of the two cameras, in metres.")
-    ] = None,
-    server: Annotated[
-        str | None,
-        typer.Option(
-            help="HOST:PORT or zenoh://HOST:PORT of a running server; default: start one.",
-            callback=_checked_server,
-        ),
-    ] = None,
+    calib: CalibOption = None,
+    fx: FocalLengthOption = None,
+    baseline: BaselineOption = None,
+    server: ServerOption = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for disparity (default: vergence-run/NAME).")
     ] = None,
-    rate: Annotated[
-        str,
-        typer.Option(help="max: every frame, losslessly. HZ or source: live, newest frames win."),
-    ] = "max",
+    rate: RateOption = "max",
     frames: Annotated[int | None, typer.Option(min=1, help="Stop after so many frames.")] = None,
     iterations: Annotated[
         int, typer.Option(min=0, help="Refinement iterations per frame; 0: the server's default.")
@@ -220,6 +231,48 @@ def _run(
             files=Files(output or (), form, kept),
             pictures=pictures,
             json=json,
+            console=_console(),
+        )
+    )
+
+
+@app.command(
+    "record",
+    epilog="""
+```
+vergence record camera:0 walk.mcap --calib rig.json    # until Ctrl-C; Foxglove shows the file
+vergence run walk.mcap                                 # the same results again
+```
+""",
+)
+def _record(
+    source: Annotated[
+        str,
+        typer.Argument(help="A folder in the layout of a data set, KIND:PATH, video or camera:0."),
+    ],
+    file: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="The file to write.")],
+    calib: CalibOption = None,
+    fx: FocalLengthOption = None,
+    baseline: BaselineOption = None,
+    server: ServerOption = None,
+    rate: RateOption = "max",
+    frames: Annotated[int | None, typer.Option(min=1, help="Stop after so many frames.")] = None,
+) -> None:
+    """Stream files or a camera, and record images, poses, calibration and depth as one MCAP file.
+
+    A viewer such as Foxglove plays the file, and `vergence run FILE.mcap` repeats the session.
+    """
+    from vergence.cli.record import record
+    from vergence.cli.sources import CalibrationFlags
+
+    _await(
+        record(
+            [source],
+            file,
+            CalibrationFlags(calib, fx, baseline),
+            server=server,
+            rate=rate,
+            frames=frames,
             console=_console(),
         )
     )

@@ -1,11 +1,10 @@
 """``vergence run``: stream files or a camera, write disparity and figures."""
 
 import asyncio
-import signal
 import time
-from collections.abc import AsyncGenerator, AsyncIterator, Iterator, Sequence
-from contextlib import aclosing, asynccontextmanager, contextmanager, nullcontext, suppress
-from dataclasses import dataclass, replace
+from collections.abc import AsyncGenerator, Iterator, Sequence
+from contextlib import aclosing
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
@@ -13,6 +12,13 @@ from rich.progress import TaskID
 
 from vergence.cli.captions import row_of, shown_in_sheet, title_of, write_sheet
 from vergence.cli.errors import CliError
+from vergence.cli.footage_session import (
+    Pace,
+    answered_frames,
+    first_frames,
+    pace_of,
+    session_for,
+)
 from vergence.cli.json_file import write_json
 from vergence.cli.local_server import server_for
 from vergence.cli.pictures import Row
@@ -20,15 +26,14 @@ from vergence.cli.progress import progress_bar
 from vergence.cli.report import Report
 from vergence.cli.result_folder import Files, KeptValues, ResultFolder, make_room
 from vergence.cli.sources import CalibrationFlags, Footage, footage_at
-from vergence.cli.streaming import AnsweredFrame, every_frame, live_frames
+from vergence.cli.streaming import AnsweredFrame
 from vergence.client import DepthClient
 from vergence.session import DepthSession
 from vergence.transports.addresses import on_this_machine
 from vergence_proto.accuracy import Accuracy
-from vergence_proto.datasets import SourceFrame
 from vergence_proto.jobs import Output
 from vergence_proto.ordered import in_order
-from vergence_proto.types import Delivery, ImageEncoding, OutputFormat
+from vergence_proto.types import OutputFormat
 
 # So many files may be in writing while the next frames are stepped.
 _WRITES_AT_ONCE = 4
@@ -54,7 +59,7 @@ async def run(
     Pictures are drawn if requested; None: of images and cameras without a calibration of their own.
     """
     footage = footage_at(sources, calibration)
-    pace = _pace(rate, footage)
+    pace = pace_of(rate, footage)
     drawn = footage.loose if pictures is None else pictures
     count = frames if footage.count is None else min(frames or footage.count, footage.count)
     directory = out or Path("vergence-run") / footage.name
@@ -69,7 +74,7 @@ async def run(
             server, console, pixels=footage.rig.left.width * footage.rig.left.height
         ) as address,
         DepthClient(address) as client,
-        _session(
+        session_for(
             client,
             footage,
             pace,
@@ -145,56 +150,6 @@ def _notes(footage: Footage) -> Iterator[str]:
         yield "the camera is read until Ctrl-C, or for --frames N"
 
 
-@dataclass(frozen=True, slots=True)
-class _Pace:
-    """How fast frames are sent, and whether one may be left out."""
-
-    delivery: Delivery
-    rate_hz: float | None = None  # None: as fast as they come, or as the server steps them
-
-
-@asynccontextmanager
-async def _session(
-    client: DepthClient, footage: Footage, pace: _Pace, output: OutputFormat, iterations: int
-) -> AsyncIterator[DepthSession]:
-    await client.server_info()  # fails at once if no server is there; a session would wait for it
-    async with client.open_session(
-        footage.rig,
-        delivery=pace.delivery,
-        output=output.resolved(),  # every pixel, whatever the link
-        encoding=ImageEncoding.RAW,
-        iterations=iterations,
-        cold_iterations=iterations if footage.alone else 0,
-        # Without a frame left out, a cold start would change what is written.
-        on_lost="raise" if pace.delivery is Delivery.EVERY else "restart",
-    ) as session:
-        yield session
-
-
-def _pace(rate: str, footage: Footage) -> _Pace:
-    """Parse ``--rate``. Raises CliError."""
-    if footage.live:
-        if rate != "max":
-            raise CliError("--rate is for files; a camera has its own rate", exit_code=2)
-        return _Pace(Delivery.NEWEST)
-    if rate == "max":
-        return _Pace(Delivery.EVERY)
-    if rate == "source":
-        if footage.fps is None:
-            raise CliError(
-                f"{footage.name} has no frame rate of its own: use --rate HZ or max",
-                exit_code=2,
-            )
-        return _Pace(Delivery.NEWEST, footage.fps)
-    try:
-        rate_hz = float(rate)
-    except ValueError:
-        rate_hz = 0.0
-    if not 0 < rate_hz < 10_000:
-        raise CliError(f"--rate: expected a rate in Hz, source or max, got {rate!r}", exit_code=2)
-    return _Pace(Delivery.NEWEST, rate_hz)
-
-
 class _Results:
     """Filter and write one result per frame, and keep the rows of the sheet."""
 
@@ -226,17 +181,14 @@ class _Results:
 async def _stream(
     session: DepthSession,
     footage: Footage,
-    pace: _Pace,
+    pace: Pace,
     count: int | None,
     results: _Results,
     console: Console,
 ) -> Report:
     report = Report()
-    frames = _first(footage, count)
-    if pace.delivery is Delivery.EVERY:
-        stream = every_frame(session, frames, in_flight=session.credit)
-    else:
-        stream = live_frames(session, frames, rate_hz=pace.rate_hz)
+    frames = first_frames(footage, count)
+    stream = answered_frames(session, footage, pace, frames)
 
     async def noted(bar: TaskID) -> AsyncGenerator[AnsweredFrame, None]:
         async for answered in stream:
@@ -262,34 +214,3 @@ async def _stream(
     report.drops = session.drops
     report.frames_unread = len(footage.unread)
     return report
-
-
-async def _first(
-    footage: Footage, count: int | None
-) -> AsyncGenerator[tuple[int, SourceFrame], None]:
-    """Yield the first ``count`` frames, or all; those of a camera until Ctrl-C."""
-    async with aclosing(footage.frames()) as frames:
-        with _interrupted() if footage.live else nullcontext(asyncio.Event()) as interrupted:
-            async for index, frame in frames:
-                yield index, frame
-                if index + 1 == count or interrupted.is_set():
-                    return
-
-
-@contextmanager
-def _interrupted() -> Iterator[asyncio.Event]:
-    """Set the event at the first Ctrl-C; the second one ends the command."""
-    event = asyncio.Event()
-    loop = asyncio.get_running_loop()
-
-    def interrupt() -> None:
-        event.set()
-        loop.remove_signal_handler(signal.SIGINT)
-
-    with suppress(NotImplementedError):  # on Windows, Ctrl-C ends the command
-        loop.add_signal_handler(signal.SIGINT, interrupt)
-    try:
-        yield event
-    finally:
-        with suppress(NotImplementedError):
-            loop.remove_signal_handler(signal.SIGINT)

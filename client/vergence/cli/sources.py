@@ -1,7 +1,7 @@
 """What the commands stream: data sets, two images, folders of images, and cameras."""
 
 from collections.abc import AsyncGenerator, Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -10,6 +10,8 @@ from vergence_proto.calibration import load_calibration
 from vergence_proto.datasets import (
     DATASETS,
     DatasetError,
+    RecordedOptions,
+    RecordedSource,
     SourceFrame,
     StereoSource,
     detect_sources,
@@ -102,6 +104,8 @@ class Footage:
     command line has calibrated them, depth is written."""
     notes: tuple[str, ...] = ()
     """What a user should know of these frames."""
+    replay: RecordedOptions | None = None
+    """The options of a recorded session, for the same results; the poses have its axes."""
     unread: dict[int, str] = field(default_factory=dict)
     """Why a file of a frame could not be read, by its index; filled while frames are read."""
 
@@ -176,6 +180,9 @@ def _camera(place: str, flags: CalibrationFlags) -> Footage:
 
 
 def _footage(source: StereoSource, *, loose: bool = False) -> Footage:
+    replay = source.options if isinstance(source, RecordedSource) else None
+    if isinstance(source, RecordedSource):
+        source = replace(source, as_sent=True)
     unread: dict[int, str] = {}
 
     def skip(index: int, error: DatasetError) -> None:
@@ -191,6 +198,7 @@ def _footage(source: StereoSource, *, loose: bool = False) -> Footage:
         metric=source.metric,
         loose=loose,
         notes=source.notes,
+        replay=replay,
         unread=unread,
     )
 
@@ -211,6 +219,8 @@ def _has_kind(text: str) -> bool:
 def _detected(text: str) -> str:
     path = Path(text)
     if path.is_file():
+        if path.suffix.lower() == ".mcap":
+            return f"mcap:{path}"
         if path.suffix.lower() in _ARCHIVES:
             raise CliError(f"{text} is an archive: use vergence batch {text}", exit_code=2)
         raise CliError(f"{text} is one file; expected two images, LEFT and RIGHT", exit_code=2)

@@ -2,7 +2,7 @@
 
 import asyncio
 import time
-from collections.abc import AsyncGenerator, AsyncIterator
+from collections.abc import AsyncGenerator, AsyncIterator, Collection
 from dataclasses import dataclass
 
 from vergence.results import DepthResult
@@ -33,23 +33,31 @@ class AnsweredFrame:
 
 
 def every_frame(
-    session: DepthSession, frames: AsyncIterator[tuple[int, SourceFrame]], *, in_flight: int
+    session: DepthSession,
+    frames: AsyncIterator[tuple[int, SourceFrame]],
+    *,
+    in_flight: int,
+    resets: Collection[int] = (),
 ) -> AsyncGenerator[AnsweredFrame, None]:
     """Step every frame, in order, with up to ``in_flight`` of them on the way.
 
     With 1 the latency is that of a frame alone; with the session's credit the server never waits.
+    The stream's memory is discarded before the frames at the indices ``resets``.
     """
 
     async def step(indexed: tuple[int, SourceFrame]) -> AnsweredFrame:
         index, source = indexed
         frame = source.frame
+        if index in resets:
+            session.reset()
         started_s = time.monotonic()
         result = await session.step(
             frame.left, frame.right, frame.pose, capture_ns=frame.capture_ns
         )
         return AnsweredFrame(index, source, result, time.monotonic() - started_s)
 
-    return in_order(frames, step, limit=in_flight)
+    # A reset applies to the next frame that is sent, which must be this one.
+    return in_order(frames, step, limit=1 if resets else in_flight)
 
 
 async def live_frames(

@@ -27,6 +27,7 @@ kind           one source                         it has
 ``booster``        ``ROOT/train/balanced/SCENE``              truth
 ``instereo2k``     ``ROOT/train/part1/000000``, a pair        truth; no metres
 ``middlebury2006`` ``ROOT/FullSize/Aloe``, a pair             truth; of 2001 to 2006
+``mcap``           ``walk.mcap``, a recorded session          poses; needs the extra ``record``
 ================== ========================================== ====================================
 
 Every source has OpenCV camera axes, metres, nanoseconds, and truth as pixel offsets
@@ -53,6 +54,7 @@ from vergence_proto.datasets import (
     kittiraw,
     middlebury,
     middlebury2006,
+    recorded,
     sceneflow,
     sintel,
     spring,
@@ -74,11 +76,14 @@ from vergence_proto.datasets.images import (
 )
 from vergence_proto.datasets.loose import open_image_folder, open_images
 from vergence_proto.datasets.packings import nominal_rig
+from vergence_proto.datasets.recorded import RecordedOptions, RecordedSource
 from vergence_proto.datasets.source import SourceFrame, StereoSource, Truth, nominal_ns
 
 __all__ = [
     "DATASETS",
     "DatasetError",
+    "RecordedOptions",
+    "RecordedSource",
     "SourceFrame",
     "StereoSource",
     "Truth",
@@ -136,6 +141,7 @@ DATASETS = {
     "flyingthings": Dataset(flyingthings.open_path, flyingthings.find),
     "irs": Dataset(irs.open_path, irs.find),
     "apollo": Dataset(apollo.open_path, apollo.find, options=("steps",)),
+    "mcap": Dataset(recorded.open_path, recorded.find),
 }
 
 
