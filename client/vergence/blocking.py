@@ -10,12 +10,10 @@ from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any, Literal, Self, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from vergence.attaching import OnLost
 from vergence.client import DepthClient
 from vergence.errors import NotOpen
+from vergence.image_format import CameraImage
 from vergence.info import ServerInfo, StreamInfo
 from vergence.results import DepthResult, NotSent, SessionEvent
 from vergence.session import DepthSession, WorldFromLeft
@@ -29,8 +27,8 @@ Value = TypeVar("Value")
 
 
 def depth(
-    left: NDArray[np.uint8],
-    right: NDArray[np.uint8],
+    left: CameraImage,
+    right: CameraImage,
     rig: StereoRig | RectifiedRig,
     *,
     server: str = DEFAULT_SERVER,
@@ -41,7 +39,8 @@ def depth(
     Parameters
     ----------
     left, right
-        uint8 [H, W] grey or [H, W, 3] RGB, of the rig's size.
+        uint8 [H, W] grey, [H, W, 3] RGB, [H, W, 4] RGBA or [H * 3/2, W] NV12, of the rig's size;
+        or the bytes of a JPEG or PNG file, which travel as they are.
     rig
         The cameras as they are; the server rectifies the images if the rig is not rectified.
     server
@@ -54,7 +53,7 @@ def depth(
     ValueError
         ``server`` is no address of a server.
     BadImage
-        An image is not uint8, or has another shape than those above.
+        An image has another type or shape, or is a damaged file.
     BadShape
         The images do not have the rig's size, or ``iterations`` is out of range.
     BadCalibration
@@ -150,8 +149,8 @@ class BlockingSession(SessionFacts):
 
     def submit(
         self,
-        left: NDArray[np.uint8],
-        right: NDArray[np.uint8],
+        left: CameraImage,
+        right: CameraImage,
         world_from_left: WorldFromLeft = None,
         *,
         capture_ns: int | None = None,
@@ -162,7 +161,8 @@ class BlockingSession(SessionFacts):
         Parameters
         ----------
         left, right
-            uint8 [H, W] grey or [H, W, 3] RGB, of the rig's size.
+            uint8 [H, W] grey, [H, W, 3] RGB, [H, W, 4] RGBA or [H * 3/2, W] NV12, of the rig's
+            size; or the bytes of a JPEG or PNG file, which travel as they are.
         world_from_left
             The left camera's pose at mid-exposure; None: not known.
         capture_ns
@@ -179,7 +179,7 @@ class BlockingSession(SessionFacts):
         Raises
         ------
         BadImage
-            An image is not uint8, or has another shape than those above.
+            An image has another type or shape, or is a damaged file.
         BadPose
             The pose is not finite, or its rotation is not orthonormal with determinant +1.
         BadShape
@@ -199,8 +199,8 @@ class BlockingSession(SessionFacts):
 
     def step(
         self,
-        left: NDArray[np.uint8],
-        right: NDArray[np.uint8],
+        left: CameraImage,
+        right: CameraImage,
         world_from_left: WorldFromLeft = None,
         *,
         capture_ns: int | None = None,
@@ -213,7 +213,7 @@ class BlockingSession(SessionFacts):
         Raises
         ------
         BadImage
-            An image is not uint8, or has another shape than [H, W] or [H, W, 3].
+            An image has another type or shape, or is a damaged file.
         BadPose
             The pose is not finite, or its rotation is not orthonormal with determinant +1.
         BadShape

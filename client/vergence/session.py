@@ -5,13 +5,10 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import Self
 
-import numpy as np
-from numpy.typing import NDArray
-
 from vergence.capture_clock import CaptureClock
 from vergence.connection import RESET
 from vergence.errors import NotOpen, WrongDelivery
-from vergence.image_format import frame_request
+from vergence.image_format import CameraImage, frame_request, sent_image
 from vergence.in_flight import FrameInFlight
 from vergence.results import DepthResult, NotSent, SessionState
 from vergence.session_facts import SessionFacts, SessionParts, SessionSetup
@@ -35,10 +32,11 @@ class DepthSession(SessionFacts):
         async for result in session:
             print(result.depth_m.shape, result.age_s)
 
-    Images are uint8, grey [H, W] or RGB [H, W, 3], and have the size of the rig; they are copied
-    before the method returns. A pose maps left-camera to world coordinates at mid-exposure, in the
-    session's axes and metres; a matrix is [3, 4] or [4, 4]. A frame without a pose starts the
-    stream's memory again if earlier frames had poses.
+    Images are uint8, grey [H, W] or RGB [H, W, 3], and have the size of the rig; other forms that
+    cameras have are listed at :meth:`submit`. They are copied before the method returns. A pose
+    maps left-camera to world coordinates at mid-exposure, in the session's axes and metres; a
+    matrix is [3, 4] or [4, 4]. A frame without a pose starts the stream's memory again if earlier
+    frames had poses.
 
     Call the methods in the thread of the event loop. A camera with callbacks in another thread
     uses ``loop.call_soon_threadsafe(session.submit, left, right, world_from_left)``.
@@ -116,8 +114,8 @@ class DepthSession(SessionFacts):
 
     def submit(
         self,
-        left: NDArray[np.uint8],
-        right: NDArray[np.uint8],
+        left: CameraImage,
+        right: CameraImage,
         world_from_left: WorldFromLeft = None,
         *,
         capture_ns: int | None = None,
@@ -128,7 +126,8 @@ class DepthSession(SessionFacts):
         Parameters
         ----------
         left, right
-            uint8 [H, W] grey or [H, W, 3] RGB, of the rig's size.
+            uint8 [H, W] grey, [H, W, 3] RGB, [H, W, 4] RGBA or [H * 3/2, W] NV12, of the rig's
+            size; or the bytes of a JPEG or PNG file, which travel as they are.
         world_from_left
             The left camera's pose at mid-exposure; None: not known.
         capture_ns
@@ -145,7 +144,7 @@ class DepthSession(SessionFacts):
         Raises
         ------
         BadImage
-            An image is not uint8, or has another shape than those above.
+            An image has another type or shape, or is a damaged file.
         BadPose
             The pose is not finite, or its rotation is not orthonormal with determinant +1.
         BadShape
@@ -177,8 +176,8 @@ class DepthSession(SessionFacts):
 
     async def step(
         self,
-        left: NDArray[np.uint8],
-        right: NDArray[np.uint8],
+        left: CameraImage,
+        right: CameraImage,
         world_from_left: WorldFromLeft = None,
         *,
         capture_ns: int | None = None,
@@ -191,7 +190,7 @@ class DepthSession(SessionFacts):
         Raises
         ------
         BadImage
-            An image is not uint8, or has another shape than [H, W] or [H, W, 3].
+            An image has another type or shape, or is a damaged file.
         BadPose
             The pose is not finite, or its rotation is not orthonormal with determinant +1.
         BadShape
@@ -278,8 +277,8 @@ class DepthSession(SessionFacts):
 
     def _request(
         self,
-        left: NDArray[np.uint8],
-        right: NDArray[np.uint8],
+        left: CameraImage,
+        right: CameraImage,
         world_from_left: WorldFromLeft,
         capture_ns: int | None,
         max_age_s: float | None,
@@ -289,12 +288,19 @@ class DepthSession(SessionFacts):
         if isinstance(world_from_left, Pose):
             world_from_left = PoseSample(world_from_left)
         capture_ns = self._clock.checked_ns(capture_ns)
-        frame = StereoFrame(self._next_id, capture_ns, left, right, world_from_left)
         camera, link = self._parts.setup.opening.rig.left, self._parts.link
+        size = (camera.width, camera.height)
+        frame = StereoFrame(
+            self._next_id,
+            capture_ns,
+            sent_image(left, size),
+            sent_image(right, size),
+            world_from_left,
+        )
         return frame_request(
             frame,
             link.images,
-            size=(camera.width, camera.height),
+            size=size,
             map_step=link.map_step,
             max_age_s=max_age_s,
         )

@@ -24,7 +24,12 @@ from vergence_proto.codec.frames import (
     timings_from_proto,
     timings_to_proto,
 )
-from vergence_proto.codec.images import check_image, image_from_proto, image_to_wire
+from vergence_proto.codec.images import (
+    camera_file,
+    check_image,
+    image_from_proto,
+    image_to_wire,
+)
 from vergence_proto.codec.planes import plane_from_proto, plane_to_proto
 from vergence_proto.codec.requests import (
     ReceivedFrame,
@@ -54,6 +59,7 @@ __all__ = [
     "Request",
     "axes_from_proto",
     "axes_to_proto",
+    "camera_file",
     "check_frame",
     "check_image",
     "decode_frame",

@@ -29,15 +29,22 @@ _FILE_KINDS = {
     pb.IMAGE_ENCODING_PNG: ImageKind.PNG,
 }
 
+_FILE_ENCODINGS = {kind: encoding for encoding, kind in _FILE_KINDS.items()}
+
 
 def image_to_wire(
-    image: NDArray[np.uint8], encoding: ImageEncoding, *, jpeg_quality: int = 90
+    image: NDArray[np.uint8] | bytes, encoding: ImageEncoding, *, jpeg_quality: int = 90
 ) -> list[Piece]:
     """Encode uint8 [H, W, 3] RGB or [H, W] grey as the pieces of a ``pb.Image``.
 
-    A piece may be a view of the image itself.
-    Raises BadImage: the image has another type or shape, is empty, or does not fit the encoding.
+    Bytes are a JPEG or PNG file and travel as they are. A piece may be a view of the image itself.
+    Raises BadImage: the image has another type or shape, is empty, or does not fit the encoding;
+    or the file is neither JPEG nor PNG, or cut short.
     """
+    if isinstance(image, bytes):
+        file = camera_file(image)
+        header = pb.Image(encoding=_FILE_ENCODINGS[file.kind], width=file.width, height=file.height)
+        return [header.SerializeToString(), *delimited(pb.Image.DATA_FIELD_NUMBER, image)]
     height, width = check_image(image).shape[:2]
     match encoding:
         case ImageEncoding.RAW:
@@ -51,6 +58,14 @@ def image_to_wire(
             data = _encoded(image, ".png", [cv2.IMWRITE_PNG_COMPRESSION, 1])  # 1: the quickest
     header = pb.Image(encoding=kind, width=width, height=height)
     return [header.SerializeToString(), *delimited(pb.Image.DATA_FIELD_NUMBER, data)]
+
+
+def camera_file(data: bytes) -> ImageFile:
+    """Examine a camera's own file. Raises BadImage: it is neither JPEG nor PNG, or cut short."""
+    file = read_image_file(data)
+    if file.kind not in _FILE_ENCODINGS:
+        raise BadImage(f"expected the bytes of a JPEG or PNG file, got {file.kind.value}")
+    return file
 
 
 def check_image(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
