@@ -2,6 +2,7 @@
 
 import difflib
 import json
+import logging
 import os
 import re
 import tomllib
@@ -14,6 +15,8 @@ from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, Settings
 from pydantic_settings.sources import InitSettingsSource
 
 from vergence_proto.text import decoded_text
+
+log = logging.getLogger(__name__)
 
 ENV_PREFIX = "VERGENCE_"
 _NESTED = "__"
@@ -258,7 +261,7 @@ class BatchSettings(_Section):
     )
 
 
-# Keys that had another name in earlier versions.
+# Keys that had another name in earlier versions. They still work, with a warning.
 _MOVED: Mapping[str, str] = {
     "grpc.credit": "streams.credit",
     "grpc.waiting_frames": "streams.waiting_frames",
@@ -313,7 +316,7 @@ def load_settings(
 
     Raises SettingsError if a key is unknown, a value is not allowed or the file cannot be read.
     """
-    from_file = _read(config) if config else {}
+    from_file = _with_new_names(_read(config) if config else {}, f"in {config}")
     _check_known(_dotted(from_file), f"in {config}")
     _check_known(
         (
@@ -336,7 +339,12 @@ def load_settings(
             dotenv_settings: PydanticBaseSettingsSource,
             file_secret_settings: PydanticBaseSettingsSource,
         ) -> tuple[PydanticBaseSettingsSource, ...]:
-            return init_settings, env_settings, InitSettingsSource(settings_cls, from_file)
+            variables = _with_new_names(env_settings(), f"in the environment ({ENV_PREFIX}...)")
+            return (
+                init_settings,
+                InitSettingsSource(settings_cls, variables),
+                InitSettingsSource(settings_cls, from_file),
+            )
 
     try:
         return Sourced(**_nested(flags or {}))
@@ -362,13 +370,27 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _check_known(keys: Iterable[str], where: str) -> None:
-    known = list(_dotted(Settings.model_construct().model_dump()))
+    known = [*_dotted(Settings.model_construct().model_dump()), *_MOVED]
     for key in keys:
         if key not in known:
-            if key in _MOVED:
-                raise SettingsError(f"setting {key!r} {where} is now called {_MOVED[key]!r}")
-            nearest = difflib.get_close_matches(key, known, n=1, cutoff=0.0)
+            nearest = difflib.get_close_matches(key, known[: -len(_MOVED)], n=1, cutoff=0.0)
             raise SettingsError(f"unknown setting {key!r} {where}; the nearest is {nearest[0]!r}")
+
+
+def _with_new_names(values: dict[str, Any], where: str) -> dict[str, Any]:
+    """Move the values of old keys to their new places, unless those are set too."""
+    for old, new in _MOVED.items():
+        section, _, key = old.partition(".")
+        if isinstance(values.get(section), dict) and key in values[section]:
+            _warn_moved(old, where)
+            value = values[section].pop(key)
+            target, _, name = new.partition(".")
+            values.setdefault(target, {}).setdefault(name, value)
+    return values
+
+
+def _warn_moved(key: str, where: str) -> None:
+    log.warning("setting %r %s is now called %r", key, where, _MOVED[key])
 
 
 def _dotted(values: Mapping[str, Any], prefix: str = "") -> Iterable[str]:

@@ -41,7 +41,7 @@ from vergence_proto.zenoh.inbox import Inbox
 from vergence_proto.zenoh.keys import StreamKeys, encoding_of
 from vergence_proto.zenoh.session import ZenohSession, make_config
 
-KEYS = StreamKeys("vergence", "benchmark")
+KEYS = StreamKeys("vergence", "place", "benchmark")
 ATTACHMENT_ID = "benchmark"
 MAP_BYTES = 200_000  # a compressed 640x480 map
 RIG = RectifiedRig(320, 240, 250.0, 250.0, 159.5, 159.5, 119.5, 0.1)

@@ -54,12 +54,12 @@ def test_the_table_of_data_sets_equals_the_code() -> None:
 
 
 def test_the_table_of_zenoh_keys_equals_the_code() -> None:
-    stream = StreamKeys("NS", "STREAM")
+    stream = StreamKeys("NS", "PLACE", "STREAM")
     unary = "{" + ",".join(UNARY_KEYS.values()) + "}"
     assert [key for key, *_ in table("## Zenoh keys")] == [
         server_key("NS", "SERVER"),
-        query_key("NS", "SERVER", OPEN),
-        query_key("NS", "SERVER", unary),
+        query_key("NS", "PRINCIPAL", "SERVER", OPEN),
+        query_key("NS", "PRINCIPAL", "SERVER", unary),
         stream.client("ATTACHMENT"),
         stream.frames,
         stream.disparity,

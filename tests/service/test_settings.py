@@ -57,20 +57,27 @@ def keys_per_table(values: Mapping[str, object]) -> dict[str, set[str]]:
         ("streams.max_pixels", "limits.max_pixels"),
     ],
 )
-def test_a_moved_key_is_named_with_its_new_place(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, old: str, new: str
+def test_a_moved_key_still_works_and_is_named_with_its_new_place(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    old: str,
+    new: str,
 ) -> None:
-    table, _, key = new.partition(".")
-    assert key in Settings().model_dump()[table]
+    table, _, name = new.partition(".")
+    assert name in Settings().model_dump()[table]
     section, _, key = old.partition(".")
     config = tmp_path / "vergence.toml"
     config.write_text(f"[{section}]\n{key} = 5\n")
     says = f"'{re.escape(old)}'.*now called '{re.escape(new)}'"
-    with pytest.raises(SettingsError, match=says):
-        load_settings(config=config)
-    monkeypatch.setenv(f"VERGENCE_{section}__{key}".upper(), "5")
-    with pytest.raises(SettingsError, match=says):
-        load_settings()
+    assert load_settings(config=config).model_dump()[table][name] == 5
+    assert re.search(says, caplog.text)
+    caplog.clear()
+    monkeypatch.setenv(f"VERGENCE_{section}__{key}".upper(), "6")
+    assert load_settings(config=config).model_dump()[table][name] == 6
+    assert re.search(says, caplog.text)
+    monkeypatch.setenv(f"VERGENCE_{new.replace('.', '__')}".upper(), "7")
+    assert load_settings(config=config).model_dump()[table][name] == 7
 
 
 def test_an_unknown_key_of_the_file_is_named_with_the_nearest_known(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """The server as seen from the Zenoh network: keys, encodings, answers to foreign clients."""
 
+import stat
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -12,10 +13,12 @@ from google.protobuf.message import Message
 from google.protobuf.wrappers_pb2 import BytesValue
 from google.rpc import status_pb2
 
-from tests.support.frames import frame_message, make_frame, open_message
+from tests.support.frames import RIG, frame_message, make_frame, open_message
 from tests.support.models import RecallModel
 from tests.support.server import running_server
+from tests.support.tokens import TokenFile
 from tests.support.zenoh_net import address_of, free_endpoint
+from tests.support.zenoh_sessions import step
 from vergence import ConnectionLost, DepthClient
 from vergence_proto.errors import BadShape, UnknownStream
 from vergence_proto.v1 import depth_pb2 as pb
@@ -24,9 +27,11 @@ from vergence_proto.zenoh.keys import ANY, StreamKeys, query_key
 from vergence_proto.zenoh.session import QueryReply, ZenohSession, make_config
 from vergence_service.app.server import Running
 from vergence_service.transports.errors import ExtraMissing, ZenohUnreachable
+from vergence_service.zenoh_command import zenoh_config
 
 NAMESPACE = "vergence"
-KEYS = StreamKeys(NAMESPACE, "s")
+MINE = "0123456789abcdef" * 2
+KEYS = StreamKeys(NAMESPACE, MINE, "s")
 
 
 class Client:
@@ -34,11 +39,11 @@ class Client:
 
     def __init__(self, peer: ZenohSession) -> None:
         self.peer = peer
-        self.inbox = Inbox("mine", bulky=pb.DisparityMap, max_bulky=100, drop_oldest=False)
+        self.inbox = Inbox(MINE, bulky=pb.DisparityMap, max_bulky=100, drop_oldest=False)
 
     async def ask(self, what: str, question: Message) -> QueryReply:
-        key = query_key(NAMESPACE, ANY, what)
-        [answer] = await self.peer.query(key, question, timeout_s=5, attachment_id="mine")
+        key = query_key(NAMESPACE, "local", ANY, what)
+        [answer] = await self.peer.query(key, question, timeout_s=5, attachment_id=MINE)
         return answer
 
     async def open(self, *, every: bool) -> None:
@@ -47,10 +52,10 @@ class Client:
         answer = await self.ask("open", open_message("s", every=every).open)
         assert answer.error is None
 
-    async def send(self, message: Message, *, attachment_id: str = "mine") -> None:
+    async def send(self, message: Message, *, attachment_id: str = MINE) -> None:
         await self.peer.put(KEYS.frames, message, attachment_id=attachment_id)
 
-    async def send_frame(self, frame_id: int, *, attachment_id: str = "mine") -> None:
+    async def send_frame(self, frame_id: int, *, attachment_id: str = MINE) -> None:
         message = frame_message(make_frame(frame_id)).frame
         await self.send(message, attachment_id=attachment_id)
 
@@ -102,7 +107,7 @@ async def test_queries_are_answered_by_messages_and_refused_by_errors_of_ours() 
         verb = await client.ask("dance", pb.GetServerInfoRequest())
         opening = await client.ask("open", pb.OpenStream(stream_id="no rig"))
         garbage = await client.ask("open", BytesValue(value=b"\xff"))
-        key = query_key(NAMESPACE, ANY, "open")
+        key = query_key(NAMESPACE, "local", ANY, "open")
         [nameless] = await client.peer.query(key, open_message("s").open, timeout_s=5)
     assert pb.GetServerInfoResponse.FromString(info.payload).model.name == "recall"
     assert isinstance(unknown.error, UnknownStream)
@@ -177,7 +182,7 @@ async def test_a_json5_file_says_where_to_listen(tmp_path: Path) -> None:
     async with running_server(RecallModel(), zenoh__enabled=True, zenoh__config=file):
         peer = ZenohSession(config)
         await peer.open()
-        key = query_key(NAMESPACE, ANY, "info")
+        key = query_key(NAMESPACE, "local", ANY, "info")
         assert len(await peer.query(key, pb.GetServerInfoRequest(), timeout_s=5)) == 1
         await peer.close()
 
@@ -233,3 +238,89 @@ async def test_what_an_operator_can_mend_is_reported_in_one_line(
     monkeypatch.delitem(sys.modules, "vergence_proto.zenoh.session")
     with pytest.raises(ExtraMissing, match=r"pip install 'vergence\[zenoh\]'"):
         await refused().__aenter__()
+
+
+async def test_a_third_node_sees_nothing_and_cannot_answer(tmp_path: Path) -> None:
+    """By default, where nobody has a name."""
+    endpoint = free_endpoint()
+    config = make_config(max_message_bytes=1 << 24, mode="client", connect__endpoints=[endpoint])
+    spy = ZenohSession(config)
+    async with (
+        running_server(RecallModel(), zenoh__enabled=True, zenoh__listen=[endpoint]),
+        spying(spy) as seen,
+        DepthClient(address_of(endpoint)) as client,
+        client.open_session(RIG) as session,
+    ):
+        await step(session, 1)
+        assert (await client.stream_info(session.stream_id)).frames_stepped == 1
+    assert seen == []
+
+
+async def test_each_user_has_its_own_keys(tmp_path: Path) -> None:
+    file = TokenFile(tmp_path / "tokens.toml", "ana", "ben", "eve")
+    endpoint = free_endpoint()
+    zenoh_config(tmp_path, tokens=file.path, endpoint=endpoint)
+    assert stat.S_IMODE((tmp_path / "users.txt").stat().st_mode) == 0o600
+
+    def address(name: str) -> str:
+        return f"{address_of(endpoint)}?config={tmp_path / name}.json5"
+
+    spy = ZenohSession(
+        make_config(
+            tmp_path / "eve.json5",
+            max_message_bytes=1 << 24,
+            mode="client",
+            connect__endpoints=[endpoint],
+        )
+    )
+    guard: dict[str, Any] = {
+        "security__tokens": file.path,
+        "zenoh__enabled": True,
+        "zenoh__config": tmp_path / "server.json5",
+    }
+    async with (
+        running_server(RecallModel(), **guard) as server,
+        spying(spy, "ana", "ben") as seen,
+        DepthClient(address("ana")) as ana,
+        DepthClient(address("ben")) as ben,
+        ana.open_session(RIG, stream_id="headset") as hers,
+        ben.open_session(RIG, stream_id="headset") as his,
+    ):
+        await step(hers, 1)
+        await step(his, 1)
+        assert sorted(each.key for each in server.engine.streams) == ["ana/headset", "ben/headset"]
+        await ana.close_stream("headset")
+        assert (await ben.stream_info("headset")).frames_stepped == 1
+        assert seen == []
+        # What the spy does itself, it may see. The server must not.
+        keys = StreamKeys(NAMESPACE, "ben", "headset")
+        await spy.put(keys.frames, frame_message(make_frame(2)).frame, attachment_id="x")
+        await step(his, 3)
+        assert (await ben.stream_info("headset")).frames_stepped == 2
+        for name in ("ana", "ben", "local"):
+            key = query_key(NAMESPACE, name, ANY, "stream")
+            question = pb.GetStreamRequest(stream_id="headset")
+            assert await spy.query(key, question, timeout_s=1) == []
+        stranger = DepthClient(address_of(endpoint))  # without a password
+        async with stranger:
+            with pytest.raises(ConnectionLost):
+                await stranger.server_info()
+
+
+@asynccontextmanager
+async def spying(spy: ZenohSession, *principals: str) -> AsyncIterator[list[str]]:
+    """All that a node sees that asks for everything, and answers everything."""
+    await spy.open()
+    seen: list[str] = []
+    known = [f"{NAMESPACE}/v1/@{name}" for name in (*principals, "local")]
+    everything = ["**", f"{NAMESPACE}/**", f"{NAMESPACE}/v1/*/**", *(f"{key}/**" for key in known)]
+    try:
+        for key in (*everything, *(f"{key}/*/disparity" for key in known)):
+            await spy.subscribe(key, lambda sample: seen.append(str(sample.key_expr)))
+        for key in (*everything, *(f"{key}/@server/*/*" for key in known)):
+            await spy.answer_queries(key, lambda query: seen.append(str(query.key_expr)))
+        for key in ("**", *(f"{key}/*/@client/*" for key in known)):
+            await spy.watch_liveliness(key, seen.append)
+        yield seen
+    finally:
+        await spy.close()

@@ -13,8 +13,8 @@ from vergence.transports.base import Answer, Call, ClientClosed, ConnectionLost
 from vergence.transports.zenoh_call import ServerInfos, ZenohCall
 from vergence_proto.errors import DepthError, StreamExpired, UnknownStream
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_proto.zenoh.keys import ANY, UNARY_KEYS, query_key
-from vergence_proto.zenoh.session import ZenohSession, make_config, reason_of
+from vergence_proto.zenoh.keys import ANY, LOCAL_PRINCIPAL, UNARY_KEYS, query_key
+from vergence_proto.zenoh.session import QueryReply, ZenohSession, make_config, reason_of
 
 _ASK_TIMEOUT_S = 1.5  # a slower server counts as absent
 _OPEN_TIMEOUT_MS = 5000  # Zenoh's handshake takes three round trips
@@ -38,6 +38,8 @@ class ZenohTransport:
         self._peer: ZenohSession | None = None  # for unary methods
         self._closed = False
         self._turn = asyncio.Lock()
+        # Who asks: the user of the configuration, or "local" if the servers know no users.
+        self._principal = ""
         self._calls: dict[str, ZenohCall] = {}  # the latest call of each stream that has not ended
 
     async def open_call(self, stream_id: str) -> Call:
@@ -48,9 +50,14 @@ class ZenohTransport:
 
         async def find(resume_token: bytes) -> ServerInfos:
             question = pb.GetStreamRequest(stream_id=stream_id, resume_token=resume_token)
-            return await self._servers_for(peer, question, before if resume_token else None)
+            infos = await self._servers_for(peer, question, before if resume_token else None)
+            if before is not None and before.server_id in infos:  # it may still have the stream
+                infos = {before.server_id: infos[before.server_id], **infos}
+            return infos
 
-        call = ZenohCall(peer, self._namespace, stream_id, find, before)
+        call = ZenohCall(
+            peer, self._namespace, stream_id, find, before, principal=lambda: self._principal
+        )
         if self._closed:
             await call.close()
             raise ClientClosed
@@ -134,9 +141,13 @@ class ZenohTransport:
 
         Raises the most specific error if every server refuses; ConnectionLost: no server answers.
         """
-        key = query_key(self._namespace, ANY, UNARY_KEYS[method])
+        answers: list[QueryReply] = []
         try:
-            answers = await peer.query(key, question, timeout_s=_ASK_TIMEOUT_S)
+            for principal in [self._principal] if self._principal else [peer.user, LOCAL_PRINCIPAL]:
+                if principal and not answers:
+                    key = query_key(self._namespace, principal, ANY, UNARY_KEYS[method])
+                    answers = await peer.query(key, question, timeout_s=_ASK_TIMEOUT_S)
+                    self._principal = principal if answers else ""
         except zenoh.ZError as error:
             raise self._lost(error) from None
         refusals = [each.error for each in answers if each.error is not None]

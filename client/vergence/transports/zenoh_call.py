@@ -24,7 +24,7 @@ from vergence_proto.errors import (
 )
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.zenoh.inbox import Inbox
-from vergence_proto.zenoh.keys import ANY, OPEN, StreamKeys, query_key, server_key
+from vergence_proto.zenoh.keys import ANY, OPEN, StreamKeys, place_of, query_key, server_key
 from vergence_proto.zenoh.session import Declaration, ZenohSession, reason_of
 
 ServerInfos = dict[str, pb.GetServerInfoResponse]  # by server id, best first
@@ -50,16 +50,18 @@ class ZenohCall:
         stream_id: str,
         find_servers: Callable[[bytes], Awaitable[ServerInfos]],
         before: "ZenohCall | None",
+        *,
+        principal: Callable[[], str],  # known when the servers are found
     ) -> None:
+        self._principal = principal
         self.stream_id: str = stream_id
         # The server on which the stream is open, or was at the last call of the stream.
         self.server_id: str = before.server_id if before else ""
         self.over: bool = False  # True: the server ended the call; it was not lost
         self._peer = peer
         self._namespace = namespace
-        self._keys = StreamKeys(namespace, stream_id)
         self._find_servers = find_servers
-        self._attachment_id = secrets.token_hex(8)
+        self._attachment_id = secrets.token_hex(16)
         self._inbox = Inbox(
             self._attachment_id, bulky=pb.DisparityMap, max_bulky=_WAITING_MAPS, drop_oldest=True
         )
@@ -130,6 +132,8 @@ class ZenohCall:
     async def _open(self, opening: pb.OpenStream) -> None:
         self._live = opening.delivery != pb.DELIVERY_EVERY
         servers = await self._find_servers(opening.resume_token)
+        place = place_of(self._principal(), self._attachment_id)
+        self._keys = StreamKeys(self._namespace, place, self.stream_id)
         peer, declared = self._peer, self._declared
         declared.append(await peer.subscribe(self._keys.disparity, self._inbox.put))
         declared.append(await peer.subscribe(self._keys.status, self._inbox.put))
@@ -139,7 +143,7 @@ class ZenohCall:
         declared.append(await peer.declare_liveliness(self._keys.client(self._attachment_id)))
         refusal: DepthError = ConnectionLost("no server answers")
         for server_id, info in servers.items():
-            key = query_key(self._namespace, server_id, OPEN)
+            key = query_key(self._namespace, self._principal(), server_id, OPEN)
             answers = await peer.query(
                 key, opening, timeout_s=_OPEN_TIMEOUT_S, attachment_id=self._attachment_id
             )

@@ -80,6 +80,11 @@ def make_config(
     return config
 
 
+def user_of(config: zenoh.Config) -> str:
+    """Return the user name in a configuration; empty if there is none."""
+    return json.loads(config.get_json("transport/auth/usrpwd/user")) or ""
+
+
 def reason_of(error: zenoh.ZError) -> str:
     """Return Zenoh's message without the line of Zenoh's source code."""
     return str(error).partition(" at /")[0]
@@ -93,6 +98,7 @@ class ZenohSession:
 
     def __init__(self, config: zenoh.Config) -> None:
         self._config = config
+        self.user = user_of(config)  # empty: without a name
         self._closed = False
         self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="zenoh")
 

@@ -24,6 +24,11 @@ def check_exposure(settings: Settings) -> None:
     credentials = chosen.tokens is not None or chosen.client_ca is not None
     if chosen.insecure:
         return
+    if credentials and settings.zenoh.enabled and settings.zenoh.config is None:
+        raise SettingsError(
+            "over Zenoh, users are checked by its own configuration: set zenoh.config to a file of "
+            "vergence zenoh-config, or start the server with --insecure"
+        )
     exposed = list(_open_zenoh(settings))
     if chosen.tls_cert is None or not credentials:
         exposed += [

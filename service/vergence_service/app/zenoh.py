@@ -54,6 +54,7 @@ async def serving_zenoh(
         connect=chosen.connect,
         shared_memory=chosen.shared_memory,
         max_frame_bytes=calls.limits.max_frame_bytes,
+        namespace=chosen.namespace,
     )
     endpoint = str(chosen.config or ",".join(listen or chosen.connect))
     async with ZenohServer(

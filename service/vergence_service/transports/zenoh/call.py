@@ -11,7 +11,7 @@ from vergence_proto.codec import ReceivedFrame, Request
 from vergence_proto.errors import Quota
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.zenoh.inbox import Inbox
-from vergence_proto.zenoh.keys import OPEN, StreamKeys, query_key
+from vergence_proto.zenoh.keys import OPEN, StreamKeys, place_of, query_key
 from vergence_proto.zenoh.session import Declaration, ZenohSession
 from vergence_service.access.principals import Principal
 from vergence_service.transports.open_calls import OpenCalls
@@ -46,6 +46,7 @@ class ZenohCall:
         self._namespace = namespace
         self._attachment_id = attachment_id
         self._calls = calls
+        self._caller = caller
         self._live = opening.delivery != pb.DELIVERY_EVERY
         self._call = calls.make(self._requests(), self._write, client="", caller=caller)
         self._inbox = Inbox(
@@ -123,11 +124,13 @@ class ZenohCall:
 
     async def _accept(self, opened: pb.StreamOpened) -> None:
         """Answer the query. Frames may follow at once, so subscribe to them first."""
-        self._keys = StreamKeys(self._namespace, opened.stream_id)
+        place = place_of(self._caller.name, self._attachment_id)
+        self._keys = StreamKeys(self._namespace, place, opened.stream_id)
         self._subscription = await self._peer.subscribe(self._keys.frames, self._inbox.put)
         query, self._query = self._query, None
         assert query is not None
-        await self._peer.reply(query, query_key(self._namespace, self._peer.id, OPEN), opened)
+        key = query_key(self._namespace, self._caller.name, self._peer.id, OPEN)
+        await self._peer.reply(query, key, opened)
 
     async def _send(self, key: str, message: Message) -> None:
         await self._peer.put(key, message, attachment_id=self._attachment_id, may_drop=self._live)

@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import re
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -12,7 +13,17 @@ from google.protobuf.message import Message
 from vergence_proto.codec import read_small
 from vergence_proto.errors import BadShape, DepthError
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_proto.zenoh.keys import ANY, OPEN, UNARY_KEYS, StreamKeys, query_key, server_key
+from vergence_proto.zenoh.keys import (
+    ANY,
+    LOCAL_PRINCIPAL,
+    OPEN,
+    UNARY_KEYS,
+    StreamKeys,
+    place_of,
+    principal_of,
+    query_key,
+    server_key,
+)
 from vergence_proto.zenoh.session import ZenohSession, make_config, reason_of
 from vergence_service.access.gate import Gate
 from vergence_service.access.principals import Principal
@@ -26,6 +37,7 @@ log = logging.getLogger(__name__)
 
 # A frame just above the limit is still received, so that the error can name the limit.
 _ROOM_OVER_THE_LIMIT = 1.25
+_ATTACHMENT_ID = re.compile("[0-9a-f]{32}")
 
 Question = TypeVar("Question", bound=Message)
 _Method = Callable[[Any, Principal], Awaitable[Message]]
@@ -39,8 +51,11 @@ def zenoh_config(
     connect: Sequence[str],
     shared_memory: bool,
     max_frame_bytes: int,
+    namespace: str,
 ) -> zenoh.Config:
     """Make the configuration, from a file or from mode and endpoints.
+
+    Without a file, a router lets nobody else answer in the server's name.
 
     Raises ZenohUnreachable if it is not a configuration.
     """
@@ -54,9 +69,31 @@ def zenoh_config(
             listen__endpoints=list(listen),
             connect__endpoints=list(connect),
             transport__shared_memory__enabled=shared_memory,
+            access_control=only_server_answers(namespace) if mode == "router" else {},
         )
     except zenoh.ZError as error:
         raise ZenohUnreachable(reason_of(error)) from None
+
+
+def only_server_answers(namespace: str) -> dict[str, Any]:
+    """Return access control for a router without users: no other node answers queries.
+
+    Nobody needs to be kept from reading: the keys of a stream contain a secret.
+    """
+    rule = {
+        "id": "answers",
+        "permission": "deny",
+        "flows": ["ingress"],
+        "messages": ["declare_queryable", "reply", "liveliness_token"],
+        "key_exprs": [f"{namespace}/v1/@{LOCAL_PRINCIPAL}/@server/**", server_key(namespace)],
+    }
+    return {
+        "enabled": True,
+        "default_permission": "allow",
+        "rules": [rule],
+        "subjects": [{"id": "everybody"}],
+        "policies": [{"rules": ["answers"], "subjects": ["everybody"]}],
+    }
 
 
 class ZenohServer:
@@ -103,11 +140,14 @@ class ZenohServer:
     async def serving(self) -> None:
         """Answer queries, and declare this server alive on the network."""
         peer, namespace = self._peer, self._namespace
-        client_keys = StreamKeys(namespace, ANY).client(ANY)
+        tokens = self._gate.tokens
+        names = [LOCAL_PRINCIPAL] if self._gate.open else sorted(tokens.names() if tokens else ())
         # Kept as long as this server serves: Zenoh removes declarations without references.
         self._declared = [
-            await peer.watch_liveliness(client_keys, self._client_died),
-            await peer.answer_queries(query_key(namespace, peer.id, ANY), self._asked),
+            *[
+                await peer.answer_queries(query_key(namespace, name, peer.id, ANY), self._asked)
+                for name in names
+            ],
             await peer.declare_liveliness(server_key(namespace, peer.id)),
         ]
 
@@ -125,8 +165,8 @@ class ZenohServer:
         attachment_id = (
             query.attachment.to_bytes().decode(errors="replace") if query.attachment else ""
         )
-        if not attachment_id or attachment_id in self._attached:
-            error = BadShape("expected a new attachment id with each open query")
+        if not _ATTACHMENT_ID.fullmatch(attachment_id) or attachment_id in self._attached:
+            error = BadShape("expected a new attachment id of 32 hex digits with each open query")
             self._start(self._peer.refuse(query, status_of(error)))
             return
         task = self._start(self._open(query, attachment_id))
@@ -138,9 +178,14 @@ class ZenohServer:
         if task := self._attached.get(key.rpartition("/")[2]):
             task.cancel()  # its stream is detached and kept for detach_grace_s
 
+    def _caller(self, query: zenoh.Query) -> Principal:
+        """Return the principal of a query: Zenoh lets others not use its key."""
+        return self._gate.named(principal_of(str(query.key_expr)))
+
     async def _open(self, query: zenoh.Query, attachment_id: str) -> None:
         with query:  # Zenoh ends the query at the latest when the call ends
             try:
+                caller = self._caller(query)
                 opening = _read(query, pb.OpenStream)
             except DepthError as error:
                 await self._peer.refuse(query, status_of(error))
@@ -151,21 +196,32 @@ class ZenohServer:
                 opening,
                 namespace=self._namespace,
                 attachment_id=attachment_id,
-                caller=self._gate.named(""),
+                caller=caller,
                 calls=self._calls,
             )
-            await call.run()
+            if not opening.stream_id:  # then the client cannot know where to show that it is alive
+                await call.run()
+                return
+            place = place_of(caller.name, attachment_id)
+            token = StreamKeys(self._namespace, place, opening.stream_id).client(attachment_id)
+            watching = await self._peer.watch_liveliness(token, self._client_died)
+            try:
+                await call.run()
+            finally:
+                await self._peer.undeclare(watching)
 
     async def _answer(self, query: zenoh.Query, what: str) -> None:
         try:
             if what not in self._methods:
                 raise BadShape(f"expected one of {', '.join([OPEN, *self._methods])}, got {what!r}")
             question, method = self._methods[what]
-            answer = await method(_read(query, question), self._gate.named(""))
+            answer = await method(_read(query, question), self._caller(query))
         except Exception as error:
             await self._peer.refuse(query, status_of(error))
         else:
-            await self._peer.reply(query, query_key(self._namespace, self._peer.id, what), answer)
+            principal = principal_of(str(query.key_expr))
+            key = query_key(self._namespace, principal, self._peer.id, what)
+            await self._peer.reply(query, key, answer)
 
     def _start(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         task = asyncio.create_task(work)
