@@ -29,7 +29,7 @@ from vergence_proto.instruction_set import instruction_set
 from vergence_service.inference.model import Step, StereoView
 from vergence_service.inference.native_model import NativeStereoModel
 from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
-from vergence_service.settings import ModelSettings
+from vergence_service.settings.sections import ModelSettings
 
 HEIGHT, WIDTH = 480, 640
 STARTS = 7  # rounds

@@ -75,7 +75,7 @@ async def test_a_newer_frame_displaces_one_that_waits() -> None:
     async with (
         lone_server(model, streams__credit=5) as (_, address),
         DepthClient(address) as client,
-        client.open_session(RIG) as session,
+        client.open_session(RIG, link="fixed") as session,
     ):
         with model.busy():
             submit(session, 1)
@@ -95,7 +95,7 @@ async def test_every_frame_of_a_burst_is_accounted_for() -> None:
     async with (
         lone_server(model, streams__credit=5) as (_, address),
         DepthClient(address) as client,
-        client.open_session(RIG) as session,
+        client.open_session(RIG, link="fixed") as session,
     ):
         with model.busy():
             submit(session, 1)
