@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import typer
 
 from vergence.cli.errors import CliError
-from vergence.transports.addresses import DEFAULT_SERVER, connector
+from vergence.cli.options import (
+    BaselineOption,
+    CalibOption,
+    FocalLengthOption,
+    JsonOption,
+    RateOption,
+    ServerOption,
+    checked_server,
+)
+from vergence.transports.addresses import DEFAULT_SERVER
 from vergence.transports.credentials import use_files
 from vergence_proto.errors import DepthError
 from vergence_proto.jobs import MAP_FORMATS, JobOutput, OnError, Output, ResultFormat
@@ -29,27 +38,6 @@ app: typer.Typer = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-
-JsonOption = Annotated[
-    Path | None, typer.Option("--json", help="Write the figures of the table to this file.")
-]
-
-CalibOption = Annotated[
-    Path | None,
-    typer.Option(help="Calibration of images or a camera, as vergence calib reads it."),
-]
-FocalLengthOption = Annotated[
-    float | None, typer.Option("--fx", min=0, help="Focal length of rectified images, in pixels.")
-]
-BaselineOption = Annotated[
-    float | None, typer.Option("--baseline", min=0, help="Distance of the two cameras, in metres.")
-]
-RateOption = Annotated[
-    str,
-    typer.Option(
-        "--rate", help="max: every frame, losslessly. HZ or source: live, newest frames win."
-    ),
-]
 
 
 def _await(work: Coroutine[Any, Any, Value]) -> Value:
@@ -81,25 +69,6 @@ def _print_version(wanted: bool) -> None:
     if wanted:
         typer.echo(f"vergence {metadata.version('vergence')}")
         raise typer.Exit
-
-
-def _checked_server(server: str | None) -> str | None:
-    if server is not None:
-        try:
-            connector(server)
-        except ValueError as error:
-            raise typer.BadParameter(str(error)) from None
-    return server
-
-
-ServerOption = Annotated[
-    str | None,
-    typer.Option(
-        "--server",
-        help="HOST:PORT or zenoh://HOST:PORT of a running server; default: start one.",
-        callback=_checked_server,
-    ),
-]
 
 
 @app.callback()
@@ -360,13 +329,20 @@ def _doctor(
     ] = None,
     *,
     server: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help="HOST:PORT or zenoh://HOST:PORT of the server to test.", callback=_checked_server
+            help="HOST:PORT, http://HOST:PORT or zenoh://HOST:PORT of the server to test.",
+            callback=checked_server,
         ),
-    ] = DEFAULT_SERVER,
+    ] = None,
+    seconds: Annotated[
+        float, typer.Option(min=1, help="With --server: the length of the test stream.")
+    ] = 5.0,
 ) -> None:
     """Report what is installed, what is missing, and whether a server answers.
+
+    With `--server`: stream a sample there as a headset would, measure times and rates, and say what
+    to expect.
 
     With a recording: find swapped eyes, rows or times that do not fit, a wrong baseline or focal
     length, and poses of other axes, inverted, or of another time.
@@ -377,10 +353,13 @@ def _doctor(
         if not examine(source, _console()):
             raise typer.Exit(1)
         return
-    from vergence.cli.doctor import doctor
+    from vergence.cli.doctor import doctor, examine_link
 
-    if not _await(doctor(server, _console())):
+    console = _console()
+    if not _await(doctor(server or DEFAULT_SERVER, console)):
         raise typer.Exit(1)
+    if server is not None:
+        _await(examine_link(server, seconds, console))
 
 
 def _contributed(entry: metadata.EntryPoint) -> Callable[..., None]:

@@ -17,6 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from vergence.cli.errors import CliError
+from vergence.cli.link_check import CAMERA_HZ, link_advice, measure_link
 from vergence.cli.sources import source_at
 from vergence.client import DepthClient
 from vergence_proto.datasets import DatasetError
@@ -66,6 +67,30 @@ async def doctor(server: str, console: Console) -> bool:
         table.add_row(finding.verdict.value, Text(finding.what), Text(finding.detail))
     console.print(table)
     return all(finding.verdict is not Verdict.BAD for finding in findings)
+
+
+async def examine_link(server: str, seconds: float, console: Console) -> None:
+    """Print what a test stream to a server measured, and what to expect of the link."""
+    figures = await measure_link(server, seconds, console)
+    link = figures.link
+    trip = "unknown" if figures.round_trip_s is None else f"{1e3 * figures.round_trip_s:.1f} ms"
+    ages = " / ".join(f"{1e3 * figures.age_s(each):.0f}" for each in (50, 95, 100))
+    images = f"JPEG {link.jpeg_quality}, " + ("half size" if link.scale == 2 else "full size")
+    rows = {
+        "session opens in": f"{figures.open_s:.2f} s",
+        "round trip": trip,
+        "results": f"{figures.results_hz:.1f} per second of {CAMERA_HZ:.0f} filmed",
+        "age": f"{ages} ms (median / 95 % / oldest)",
+        "longest silence": f"{figures.longest_silence_s:.2f} s",
+        "limited by": link.limited_by,
+        "chosen": f"{images}; maps of every {link.map_step}. pixel" if link.adapts else "exact",
+    }
+    table = Table(show_header=False, box=None)
+    for name, value in rows.items():
+        table.add_row(name, Text(value))
+    console.print(table)
+    for sentence in link_advice(figures):
+        console.print(Text(sentence), soft_wrap=True)
 
 
 def examine(text: str, console: Console) -> bool:
