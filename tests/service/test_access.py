@@ -402,7 +402,10 @@ async def test_the_environment_and_the_command_make_and_show_tokens(
     guarded: Guarded, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     def command(*words: str) -> subprocess.CompletedProcess[str]:
-        code = "import typer; from vergence_service.token_command import token; typer.run(token)"
+        code = (
+            "import typer; from vergence_service.token_command import token; "
+            "app = typer.Typer(); app.command()(token); app()"
+        )
         file = ("--file", str(tmp_path / "tokens.toml"))
         return subprocess.run(
             [sys.executable, "-c", code, *words, *file], capture_output=True, text=True, check=False
