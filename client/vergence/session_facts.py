@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vergence.attaching import RecoveryRules
 from vergence.connection import StreamConnection
@@ -16,6 +17,7 @@ from vergence.in_flight import FramesInFlight
 from vergence.info import ModelInfo
 from vergence.info_codec import model_info_from_proto
 from vergence.link import LinkRules, LinkState, SessionLink
+from vergence.raw_pixels import image_pixels
 from vergence.recording import SessionRecording
 from vergence.reprojection import DepthView, Fill, View
 from vergence.responses import ResponseRouter
@@ -96,6 +98,32 @@ class SessionFacts:
         """The rig of every result: the one of ``open_session``, or its rectification."""
         self._parts.opened()
         return self._parts.responses.rig
+
+    @property
+    def left_from_rectified(self) -> Pose:
+        """Maps rectified-left to left-camera coordinates, in OpenCV axes: a rotation.
+
+        It is the identity if the rig of ``open_session`` is rectified.
+        """
+        opened = self._parts.opened()
+        if not opened.HasField("left_from_rectified"):
+            return Pose.identity()
+        return codec.pose_from_proto(opened.left_from_rectified)
+
+    def image_pixels(self) -> NDArray[np.float32]:
+        """Return where each pixel of a map is in the left image as the camera took it.
+
+        The camera's own image can so be coloured by a map, or a map by the image
+        (``cv2.remap(image, pixels, None, cv2.INTER_LINEAR)`` is the rectified image).
+
+        Returns
+        -------
+        NDArray[np.float32]
+            [H, W, 2], pixels (x, y). A pixel that the camera did not see lies outside the image.
+        """
+        rig = self.rig  # first: it raises NotOpen
+        camera = codec.rig_from_proto(self._parts.setup.opening.rig).left
+        return image_pixels(camera, rig, self.left_from_rectified)
 
     @property
     def model(self) -> ModelInfo:

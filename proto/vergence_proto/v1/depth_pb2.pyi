@@ -164,7 +164,7 @@ class OpenStream(_message.Message):
     def __init__(self, stream_id: _Optional[str] = ..., resume_token: _Optional[bytes] = ..., rig: _Optional[_Union[StereoRig, _Mapping[str, _Any]]] = ..., axes: _Optional[_Union[Axes, str]] = ..., delivery: _Optional[_Union[Delivery, str]] = ..., output: _Optional[_Union[OutputFormat, _Mapping[str, _Any]]] = ..., iterations: _Optional[int] = ..., cold_iterations: _Optional[int] = ..., weights_sha256: _Optional[str] = ..., opening_id: _Optional[bytes] = ...) -> None: ...
 
 class StreamOpened(_message.Message):
-    __slots__ = ("stream_id", "resume_token", "credit", "rig", "model", "resumed", "detach_grace_s", "idle_timeout_s", "last_frame_id", "silent_s", "max_frame_scale", "paced_credit")
+    __slots__ = ("stream_id", "resume_token", "credit", "rig", "model", "resumed", "detach_grace_s", "idle_timeout_s", "last_frame_id", "silent_s", "max_frame_scale", "paced_credit", "left_from_rectified")
     STREAM_ID_FIELD_NUMBER: _ClassVar[int]
     RESUME_TOKEN_FIELD_NUMBER: _ClassVar[int]
     CREDIT_FIELD_NUMBER: _ClassVar[int]
@@ -177,6 +177,7 @@ class StreamOpened(_message.Message):
     SILENT_S_FIELD_NUMBER: _ClassVar[int]
     MAX_FRAME_SCALE_FIELD_NUMBER: _ClassVar[int]
     PACED_CREDIT_FIELD_NUMBER: _ClassVar[int]
+    LEFT_FROM_RECTIFIED_FIELD_NUMBER: _ClassVar[int]
     stream_id: str
     resume_token: bytes
     credit: int
@@ -189,7 +190,8 @@ class StreamOpened(_message.Message):
     silent_s: float
     max_frame_scale: int
     paced_credit: int
-    def __init__(self, stream_id: _Optional[str] = ..., resume_token: _Optional[bytes] = ..., credit: _Optional[int] = ..., rig: _Optional[_Union[RectifiedRig, _Mapping[str, _Any]]] = ..., model: _Optional[_Union[ModelInfo, _Mapping[str, _Any]]] = ..., resumed: bool = ..., detach_grace_s: _Optional[float] = ..., idle_timeout_s: _Optional[float] = ..., last_frame_id: _Optional[int] = ..., silent_s: _Optional[float] = ..., max_frame_scale: _Optional[int] = ..., paced_credit: _Optional[int] = ...) -> None: ...
+    left_from_rectified: Pose
+    def __init__(self, stream_id: _Optional[str] = ..., resume_token: _Optional[bytes] = ..., credit: _Optional[int] = ..., rig: _Optional[_Union[RectifiedRig, _Mapping[str, _Any]]] = ..., model: _Optional[_Union[ModelInfo, _Mapping[str, _Any]]] = ..., resumed: bool = ..., detach_grace_s: _Optional[float] = ..., idle_timeout_s: _Optional[float] = ..., last_frame_id: _Optional[int] = ..., silent_s: _Optional[float] = ..., max_frame_scale: _Optional[int] = ..., paced_credit: _Optional[int] = ..., left_from_rectified: _Optional[_Union[Pose, _Mapping[str, _Any]]] = ...) -> None: ...
 
 class Frame(_message.Message):
     __slots__ = ("frame_id", "capture_ns", "left", "right", "pose", "max_age_s", "scale", "map_step")

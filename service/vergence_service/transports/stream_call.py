@@ -218,6 +218,11 @@ class DepthCall:
             silent_s=self._limits.silent_s,
             max_frame_scale=codec.MAX_FRAME_SCALE,
             paced_credit=self._most_unanswered(stream),
+            left_from_rectified=(
+                None
+                if stream.rectifier.maps is None
+                else codec.pose_to_proto(stream.rectifier.left_from_rectified)
+            ),
         )
 
     def _most_unanswered(self, stream: Stream) -> int:
