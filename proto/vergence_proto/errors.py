@@ -14,6 +14,7 @@
     |-- UnknownSequence, SequenceNotDone, QueueFull      the job or its result is not available
     |-- InsufficientStorage                              the server's disk has no room
     |-- Unauthenticated, Forbidden                       no valid credential, or too few rights
+    |-- KeyReused, KeyInUse                              an Idempotency-Key of another request
     |-- Draining, NotReady                               not now: try again, or on another server
     `-- ModelFailed, NonFinite                           the server's own failure
 
@@ -56,6 +57,8 @@ class ErrorCode(StrEnum):
     INSUFFICIENT_STORAGE = "INSUFFICIENT_STORAGE"
     UNAUTHENTICATED = "UNAUTHENTICATED"
     FORBIDDEN = "FORBIDDEN"
+    KEY_REUSED = "KEY_REUSED"
+    KEY_IN_USE = "KEY_IN_USE"
 
 
 ERROR_DOMAIN = "vergence"  # google.rpc.ErrorInfo.domain
@@ -240,6 +243,18 @@ class Forbidden(DepthError):
     """The caller has no right to this, or a foreign web page sent the request."""
 
     code = ErrorCode.FORBIDDEN
+
+
+class KeyReused(DepthError):
+    """The Idempotency-Key belongs to a request with another body or other options."""
+
+    code = ErrorCode.KEY_REUSED
+
+
+class KeyInUse(DepthError):
+    """The first request with this Idempotency-Key is still being received."""
+
+    code = ErrorCode.KEY_IN_USE
 
 
 ERROR_CLASSES: dict[ErrorCode, type[DepthError]] = {

@@ -40,7 +40,7 @@ def made_frame(index: int, *, posed: bool = True, lost: bool = False) -> JobFram
         10**18 + index * 33_333_333,
         RIG,
         disparity_px,
-        sigma_px=disparity_px / 7,
+        sigma_px=disparity_px / np.float32(7),
         confidence=np.full(disparity_px.shape, 200, np.uint8),
         world_from_left=pose,
     )
@@ -92,10 +92,9 @@ def depth_of(frame: JobFrame) -> NDArray[np.float32]:
     return np.nan_to_num(frame.disparity.depth_m)
 
 
-def points(
-    depth_m: NDArray[Any], fx: float, fy: float, cx: float, cy: float, world: NDArray[Any]
-) -> NDArray[np.float64]:
+def points(depth_m: NDArray[Any], camera: list[float], world: NDArray[Any]) -> NDArray[np.float64]:
     """Points by the formula of tools whose pixel centres lie at halves, OpenCV camera axes."""
+    fx, fy, cx, cy = camera
     v, u = np.nonzero(depth_m)
     z = depth_m[v, u]
     xyz = np.stack([(u + 0.5 - cx) / fx * z, (v + 0.5 - cy) / fy * z, z, np.ones_like(z)])
@@ -134,7 +133,7 @@ def test_nerfstudio_puts_every_point_where_it_is() -> None:
         assert np.abs(stored / 1000 - depth_of(frame)).max() <= 0.5e-3 + 1e-6
         opencv_camera = np.array(entry["transform_matrix"]) @ np.diag([1, -1, -1, 1])
         expected, _ = points_of(frame)
-        found = points(depth_of(frame), *camera, opencv_camera)
+        found = points(depth_of(frame), camera, opencv_camera)
         np.testing.assert_allclose(found, expected, atol=1e-5)
         assert files[entry["file_path"]] == frame.left
 
@@ -152,7 +151,7 @@ def test_colmap_puts_every_point_where_it_is() -> None:
         assert size == b""
         depth_m = np.frombuffer(planes, "<f4").reshape(RIG.height, RIG.width)
         np.testing.assert_array_equal(depth_m, depth_of(frame))
-        found = points(depth_m, *map(float, camera), left_from_world.inverse().matrix)
+        found = points(depth_m, [*map(float, camera)], left_from_world.inverse().matrix)
         np.testing.assert_allclose(found, points_of(frame)[0], atol=1e-5)
         assert files[f"images/{row[9]}"] == frame.left
 

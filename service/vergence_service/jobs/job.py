@@ -40,6 +40,8 @@ class Job:
     owner: str = ""  # principal that submitted it; empty: one of an older server
     name: str = ""  # the client's own name for it
     labels: Mapping[str, str] = field(default_factory=dict)  # the client's own
+    key: str = ""  # the client's key of the submission, so that it is not accepted twice
+    key_fingerprint: str = ""  # of the request with this key
     options: JobOptions = field(default_factory=JobOptions)
     upload_sha256: str = ""  # of the body of the request, or of the upload
     warnings: tuple[JobWarning, ...] = ()

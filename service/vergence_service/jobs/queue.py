@@ -5,7 +5,7 @@ import secrets
 import time
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
 
@@ -16,10 +16,11 @@ from vergence_service.jobs.forecast import forecast
 from vergence_service.jobs.job import Job, JobOptions
 from vergence_service.jobs.progress import JobStatus
 from vergence_service.jobs.registry import JobRegistry
-from vergence_service.jobs.results import result_bytes
+from vergence_service.jobs.results import read_records, result_bytes
 from vergence_service.jobs.run import job_stream_config
 from vergence_service.jobs.sources import check_readable, find_sequence, missing_images
 from vergence_service.jobs.store import JobStore, folder_bytes, remove_folder
+from vergence_service.jobs.tally import tally_of
 from vergence_service.jobs.upload_checks import checking_folder
 from vergence_service.jobs.worker import JobWorker
 from vergence_service.streams.engine import DepthEngine
@@ -48,6 +49,8 @@ class JobOrder:
     options: JobOptions = field(default_factory=JobOptions)
     name: str = ""
     labels: Mapping[str, str] = field(default_factory=dict)
+    key: str = ""  # so that a repeated submission is not accepted twice
+    key_fingerprint: str = ""
 
 
 class JobQueue:
@@ -174,6 +177,8 @@ class JobQueue:
             owner=owner.name,
             name=order.name,
             labels=order.labels,
+            key=order.key,
+            key_fingerprint=order.key_fingerprint,
             options=options,
             upload_sha256=upload_sha256,
             warnings=found.warnings,
@@ -198,6 +203,22 @@ class JobQueue:
             self._engine.metrics.sequences_refused.inc()
             log.warning("an upload of %s was refused: %s", job.client or "a client", error)
             raise
+
+    async def cancel(self, job_id: str) -> JobStatus:
+        """Stop a job and keep the frames that are done. Nothing happens if it has ended.
+
+        Raises UnknownSequence.
+        """
+        if not self.jobs.get(job_id).ended:
+            await to_the_end(self._cancel(self.jobs.cancel(job_id)))
+        return self.jobs.status(job_id)
+
+    async def _cancel(self, job: Job) -> None:
+        await self._worker.cancel(job.job_id)
+        result = self.jobs.folder(job.job_id) / "result"
+        kept = await self.threads.run(lambda: tally_of(read_records(result)))
+        ended = replace(job, reached=kept.frames, frames_failed=kept.failed, cold_frames=kept.cold)
+        await self.jobs.finish(ended, on_kept=lambda: None)
 
     async def delete(self, job_id: str) -> None:
         """Stop a job if it has not ended, and delete all its files. Raises UnknownSequence."""

@@ -5,7 +5,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from vergence_proto.errors import (
@@ -16,8 +16,10 @@ from vergence_proto.errors import (
 )
 from vergence_proto.jobs import JobState
 from vergence_service.access.principals import Principal
+from vergence_service.jobs.etas import Place, eta_s, places_of
+from vergence_service.jobs.index import JobIndex
 from vergence_service.jobs.job import Job
-from vergence_service.jobs.progress import JobProgress, JobStatus, work_until
+from vergence_service.jobs.progress import JobProgress, JobStatus
 from vergence_service.jobs.results import has_frames
 from vergence_service.jobs.storage import check_free, disk_trouble, flushing
 from vergence_service.jobs.store import JobStore, folder_bytes
@@ -27,14 +29,6 @@ from vergence_service.threads import ThreadPool, to_the_end
 _USUAL_JOB_S = 2.0
 _PROGRESS_EVERY_S = 0.25
 _LONGEST_RETRY_S = 3600.0
-
-
-@dataclass(frozen=True, slots=True)
-class _Place:
-    """The place of an unfinished job."""
-
-    ahead: int  # jobs before it
-    work: float  # of the waiting ones before it
 
 
 class JobRegistry:
@@ -52,13 +46,14 @@ class JobRegistry:
         self._keep_s = keep_s
         self._disk_bytes = disk_bytes
         self._jobs: dict[str, Job] = {}
+        self._index = JobIndex()
         self._running: dict[str, JobProgress] = {}
         self._readers: Counter[str] = Counter()
         self._changed = asyncio.Event()  # set at a change, and then replaced
         self._progress_due: asyncio.TimerHandle | None = None
         self._last_job_s = _USUAL_JOB_S
         self._work_per_s: float | None = None  # of the last run
-        self._order: dict[str, _Place] | None = None  # of the unfinished jobs; None: has changed
+        self._order: dict[str, Place] | None = None  # of the unfinished jobs; None: has changed
 
     async def load(self) -> None:
         """Read the jobs of earlier servers."""
@@ -66,9 +61,7 @@ class JobRegistry:
             if job.ended and job.finished_up_s is None:  # by a version without this field
                 job = replace(job, finished_up_s=self._store.uptime_s())
                 await self._background.run(self._store.update, job)
-            self._jobs[job.job_id] = job
-
-    # Reading.
+            self._enter(job)
 
     def get(self, job_id: str) -> Job:
         """Return a job. Raises UnknownSequence."""
@@ -106,50 +99,39 @@ class JobRegistry:
         progress = self._running.get(job_id)
         done = self._frames_done(job)
         fps = job.fps if progress is None else progress.fps or None
-        return JobStatus(job, done, place.ahead, fps, self._eta_s(job, place), None)
+        running = [
+            (self._jobs[each], run) for each, run in self._running.items() if each in self._jobs
+        ]
+        eta = eta_s(job, place, running, self._frames_done, self._work_per_s)
+        return JobStatus(job, done, place.ahead, fps, eta, None)
 
-    def _places(self) -> "dict[str, _Place]":
+    def _places(self) -> dict[str, Place]:
         if self._order is None:
-            self._order, work = {}, 0.0
-            for ahead, job in enumerate(self.unfinished()):
-                running = job.job_id in self._running
-                self._order[job.job_id] = _Place(0 if running else ahead, work)
-                if not running:
-                    work += work_until(job, job.frames) - work_until(job, job.reached)
+            self._order = places_of(self.unfinished(), self._running)
         return self._order
-
-    def _eta_s(self, job: Job, place: "_Place") -> float | None:
-        """Estimate the time until a job is done, from the speed of the last runs."""
-        rates = {
-            running: progress.work_per_s(self._jobs[running])
-            for running, progress in self._running.items()
-            if running in self._jobs
-        }
-        rate = rates.get(job.job_id) or next(filter(None, rates.values()), self._work_per_s)
-        if not rate:
-            return None
-        before = place.work
-        if job.job_id not in self._running:
-            for running in rates:
-                each = self._jobs[running]
-                before += work_until(each, each.frames) - work_until(each, self._frames_done(each))
-        own = work_until(job, job.frames) - work_until(job, self._frames_done(job))
-        return (before + own) / rate
 
     def expires_s(self, job: Job) -> float | None:
         """Return the Unix time until which the result of an ended job is kept, at least."""
         return None if job.finished_s is None else job.finished_s + self._keep_s
 
-    def statuses(self, caller: Principal) -> list[JobStatus]:
-        """Return the caller's jobs with their progress, oldest first; all for an administrator.
+    def page(
+        self, wanted: Callable[[Job], bool], *, size: int, below: int | None = None
+    ) -> tuple[list[JobStatus], int | None]:
+        """Return a page of jobs with their progress, see :meth:`JobIndex.page`."""
+        job_ids, following = self._index.page(self._jobs, wanted, size=size, below=below)
+        return [self.status(job_id) for job_id in job_ids], following
 
-        Callers without a credential share a name, so they see none: the id of a job is its secret.
+    def frames_of(self, job_id: str) -> tuple[JobStatus, Path]:
+        """Return a job and the folder of its frames, of which ``frames_done`` can be read.
+
+        Raises UnknownSequence.
         """
-        return [
-            self.status(job_id)
-            for job_id, job in self._jobs.items()
-            if caller.proven and caller.owns(job.owner)
-        ]
+        return self.status(job_id), self.folder(job_id) / "result"
+
+    def keyed(self, key: str) -> Job | None:
+        """Return the job that was submitted with this key, if any."""
+        job_id = self._index.keyed(key)
+        return None if job_id is None else self._jobs.get(job_id)
 
     def result(self, job_id: str) -> tuple[Job, Path]:
         """Return a job that has ended with any result, and the folder of its result.
@@ -193,8 +175,6 @@ class JobRegistry:
         """Return the folder with the files of a job."""
         return self._store.folder(job_id)
 
-    # Changing.
-
     async def add(self, folder: Path, job: Job) -> None:
         """Add a job with its uploaded files. When this returns, a crash does not lose the job."""
         await to_the_end(self._add(folder, job))
@@ -202,8 +182,18 @@ class JobRegistry:
     async def _add(self, folder: Path, job: Job) -> None:
         await self._background.finish(flushing(folder))
         await self._background.run(self._store.insert, folder, job)
-        self._jobs[job.job_id] = job
+        self._enter(job)
         self._notify_changed()
+
+    def _enter(self, job: Job) -> None:
+        self._jobs[job.job_id] = job
+        self._index.add(job)
+
+    def _leave(self, job_id: str) -> None:
+        job = self._jobs.pop(job_id, None)
+        if job is not None:
+            self._index.remove(job)
+            self._order = None
 
     def begin_run(self, job_id: str) -> JobProgress:
         """Record that the worker runs a job; return the progress of the run, for it to update."""
@@ -225,13 +215,29 @@ class JobRegistry:
 
     async def update(self, job: Job) -> None:
         """Replace the entry of a job, unless it was deleted."""
+        if self._cancelled(job):
+            return
         await self._background.run(self._store.update, job)
-        if job.job_id in self._jobs:
+        if job.job_id in self._jobs and not self._cancelled(job):
             self._jobs[job.job_id] = job
             self._notify_changed()
 
+    def _cancelled(self, job: Job) -> bool:
+        """Return whether a job was cancelled meanwhile: its run has nothing more to record."""
+        known = self._jobs.get(job.job_id)
+        return known is not None and known.state is JobState.CANCELLED
+
+    def cancel(self, job_id: str) -> Job:
+        """Let no run of a job begin or record anything; :meth:`finish` follows."""
+        job = replace(self.get(job_id), state=JobState.CANCELLED, reason=None, message=None)
+        self._jobs[job_id] = job
+        self._notify_changed()
+        return job
+
     async def keep_waiting(self, job: Job) -> None:
         """Record why a job waits: here, and on the disk if it can be written."""
+        if self._cancelled(job):
+            return
         if job.job_id in self._jobs:
             self._jobs[job.job_id] = job
             self._notify_changed()
@@ -246,6 +252,8 @@ class JobRegistry:
 
         ``on_kept`` is called when the end is on the disk, before anybody sees it here.
         """
+        if job.state is not JobState.CANCELLED and self._cancelled(job):
+            return
         used = 0
         result = self._store.folder(job.job_id) / "result"
         if await self._background.run(result.exists):
@@ -269,16 +277,13 @@ class JobRegistry:
     def hide(self, job_id: str) -> None:
         """Make a job unknown to readers at once; :meth:`delete` follows. Raises UnknownSequence."""
         self.get(job_id)
-        del self._jobs[job_id]
-        self._order = None
+        self._leave(job_id)
 
     async def delete(self, job_id: str) -> None:
         """Delete a job with its row and its files."""
-        self._jobs.pop(job_id, None)
+        self._leave(job_id)
         await self._background.run(self._store.delete, job_id)
         self._notify_changed()
-
-    # Limits of age and disk space.
 
     def used_bytes(self) -> int:
         """Return the disk space that all jobs use or have reserved."""

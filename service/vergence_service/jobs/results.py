@@ -9,6 +9,7 @@ A frame that could not be read or stepped has a file too, with the reason instea
 """
 
 import dataclasses
+import itertools
 import json
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -128,12 +129,19 @@ def checking_frames(folder: Path, count: int) -> Iterator[bool]:
         yield False
 
 
-def read_records(folder: Path, start: int = 0) -> Iterator[FrameRecord]:
-    """Read the records of the frames from ``start`` on that are done, in order."""
-    for path in sorted(folder.glob(f"*{SUFFIX}")):
-        if int(path.stem) >= start:
-            with path.open("rb") as file:
-                yield decode_record(file.readline(_LONGEST_RECORD))
+def read_records(folder: Path, start: int = 0, count: int | None = None) -> Iterator[FrameRecord]:
+    """Read the records of ``count`` frames from ``start`` on, in order, as far as they are done.
+
+    Raises BadImage: a file is damaged.
+    """
+    indices = itertools.count(start) if count is None else range(start, start + count)
+    for index in indices:
+        try:
+            with frame_path(folder, index).open("rb") as file:
+                line = file.readline(_LONGEST_RECORD)
+        except FileNotFoundError:
+            return
+        yield decode_record(line)
 
 
 def read_frame(folder: Path, index: int, rig: RectifiedRig | None) -> JobFrame:

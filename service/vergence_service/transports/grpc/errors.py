@@ -47,6 +47,8 @@ GRPC_STATUS: Mapping[ErrorCode, grpc.StatusCode] = {
     ErrorCode.INSUFFICIENT_STORAGE: grpc.StatusCode.RESOURCE_EXHAUSTED,
     ErrorCode.UNAUTHENTICATED: grpc.StatusCode.UNAUTHENTICATED,
     ErrorCode.FORBIDDEN: grpc.StatusCode.PERMISSION_DENIED,
+    ErrorCode.KEY_REUSED: grpc.StatusCode.INVALID_ARGUMENT,
+    ErrorCode.KEY_IN_USE: grpc.StatusCode.ABORTED,
 }
 
 

@@ -45,6 +45,8 @@ HTTP_STATUS: Mapping[ErrorCode, int] = {
     ErrorCode.QUOTA: 429,
     ErrorCode.QUEUE_FULL: 429,
     ErrorCode.INSUFFICIENT_STORAGE: 507,
+    ErrorCode.KEY_REUSED: 422,
+    ErrorCode.KEY_IN_USE: 409,
     ErrorCode.FRAME_STALE: 504,
     ErrorCode.DRAINING: 503,
     ErrorCode.NOT_READY: 503,
@@ -75,7 +77,7 @@ PROBLEM_RESPONSE: dict[int | str, dict[str, Any]] = {
                     "title": "Not Found",
                     "status": 404,
                     "detail": "no sequence '5f0c': it never existed, was deleted, or its result "
-                    "expired, 24 h after its end or when disk space ran short",
+                    "expired, 24 h after its end",
                     "reason": "SEQUENCE_UNKNOWN",
                 },
             }

@@ -1,12 +1,14 @@
 """The queries and answers of /v1/sequences."""
 
 from datetime import UTC, datetime
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from vergence_proto.errors import ErrorCode
 from vergence_proto.jobs import JobOutput, JobState, OnError, ResultFormat, WarningKind
 from vergence_service.jobs.progress import JobStatus
+from vergence_service.transports.http.pages import LABEL
 
 _EXAMPLE: dict[str, JsonValue] = {
     "id": "5f0c9a7be21d4433",
@@ -20,6 +22,7 @@ _EXAMPLE: dict[str, JsonValue] = {
     "eta_s": 5.7,
     "expires": None,
     "name": "drive 17",
+    "labels": {"robot": "r2"},
     "output": ["disparity"],
     "on_error": "skip",
     "iterations": 0,
@@ -57,6 +60,9 @@ class SubmitQuery(BaseModel):
         default=OnError.SKIP, description="what a frame does that cannot be read or stepped"
     )
     name: str = Field(default="", max_length=200, description="your name for the job")
+    label: list[Annotated[str, Field(pattern=LABEL)]] = Field(
+        default=[], max_length=16, description="your labels for the job, KEY:VALUE"
+    )
     metrics: bool = Field(default=False, description="compare with the ground truth in the archive")
     wait: bool = Field(default=False, description="answer with the result, when the job is done")
     format: ResultFormat = Field(
@@ -96,6 +102,7 @@ class SequenceJob(BaseModel):
         description="time until which its result is kept, at least; null before its end"
     )
     name: str
+    labels: dict[str, str]
     output: list[JobOutput]
     on_error: OnError
     iterations: int
@@ -130,6 +137,7 @@ class SequenceJob(BaseModel):
             if status.expires_s is None
             else datetime.fromtimestamp(status.expires_s, UTC),
             name=job.name,
+            labels=dict(job.labels),
             output=list(job.options.outputs),
             on_error=job.options.on_error,
             iterations=job.options.iterations,

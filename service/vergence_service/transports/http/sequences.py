@@ -17,19 +17,23 @@ from vergence_proto.errors import (
 )
 from vergence_proto.jobs import JobOutput, JobState, ResultFormat
 from vergence_service.jobs.archive import CannotEncode, mp4_of, zip_of
-from vergence_service.jobs.job import JobOptions
+from vergence_service.jobs.job import Job, JobOptions
 from vergence_service.jobs.progress import JobStatus
 from vergence_service.jobs.queue import JobOrder, JobQueue
 from vergence_service.jobs.registry import JobRegistry
 from vergence_service.threads import ThreadPool
 from vergence_service.transports.callers import CALLER
 from vergence_service.transports.http.errors import PROBLEM_RESPONSE
+from vergence_service.transports.http.frame_routes import frame_routes
+from vergence_service.transports.http.idempotency import KeysInUse, Submission, check_digest
+from vergence_service.transports.http.pages import ListQuery
 from vergence_service.transports.http.sequence_models import ResultQuery, SequenceJob, SubmitQuery
 from vergence_service.transports.http.uploads import (
     ARCHIVE_TYPES,
     FORM_TYPE,
     UploadLimits,
     client_of,
+    digest_of,
     receive_sequence,
     while_connected,
 )
@@ -77,11 +81,12 @@ def sequence_routes(
     queue: JobQueue, *, model: str, limits: UploadLimits, stopping: asyncio.Event
 ) -> APIRouter:
     """Make the routes. ``stopping`` ends the answers that wait for a job while the server stops."""
-    jobs, threads = queue.jobs, queue.threads
+    jobs, threads, keys = queue.jobs, queue.threads, KeysInUse()
     router = APIRouter(tags=["sequences"], responses=PROBLEM_RESPONSE)
 
     @router.post(
         "/v1/sequences",
+        operation_id="submit_sequence",
         status_code=202,
         responses={**_RESULT, **_ACCEPTED},
         openapi_extra=_UPLOAD,
@@ -94,6 +99,8 @@ def sequence_routes(
         """
         if query.model not in (None, model):
             raise BadShape(f"expected {model}, the model of this server, got {query.model!r}")
+        client, caller = client_of(request), CALLER.get()
+        submission = Submission.of(request, caller)
         order = JobOrder(
             source=query.source,
             options=JobOptions(
@@ -103,15 +110,25 @@ def sequence_routes(
                 on_error=query.on_error,
             ),
             name=query.name,
+            labels=dict(label.split(":", 1) for label in query.label),
+            key=submission.key,
+            key_fingerprint=submission.fingerprint,
         )
-        client, caller = client_of(request), CALLER.get()
         upload_bytes = int(request.headers.get("content-length", 0))
-        async with queue.upload_folder(client, upload_bytes=upload_bytes, owner=caller) as folder:
-            digest = await receive_sequence(request, folder, limits, threads)
-            async with while_connected(request):
-                status = await queue.accept(
-                    folder, order, upload_sha256=digest, client=client, owner=caller
-                )
+        with keys.taken(submission.key):
+            if (earlier := jobs.keyed(submission.key)) is not None:
+                await _check_repeated(request, submission, earlier, limits, threads)
+                status = jobs.status(earlier.job_id)
+            else:
+                async with queue.upload_folder(
+                    client, upload_bytes=upload_bytes, owner=caller
+                ) as folder:
+                    digest = await receive_sequence(request, folder, limits, threads)
+                    check_digest(submission.body_sha256, digest)
+                    async with while_connected(request):
+                        status = await queue.accept(
+                            folder, order, upload_sha256=digest, client=client, owner=caller
+                        )
         job_id = status.job.job_id
         if query.wait:
             while not (status := jobs.status(job_id)).job.ended and not stopping.is_set():
@@ -129,12 +146,40 @@ def sequence_routes(
             headers={"Location": f"/v1/sequences/{job_id}"},
         )
 
-    @router.get("/v1/sequences")
-    async def list_sequences() -> list[SequenceJob]:
-        """List the jobs of the caller, oldest first; none if the server asks for no credential."""
-        return [SequenceJob.of(status) for status in jobs.statuses(CALLER.get())]
+    @router.get(
+        "/v1/sequences",
+        operation_id="list_sequences",
+        response_class=Response,
+        responses={
+            200: {
+                "model": list[SequenceJob],
+                "description": "A page. The header `Link` has the address of the next one, if any",
+            }
+        },
+    )
+    async def list_sequences(request: Request, query: Annotated[ListQuery, Query()]) -> Response:
+        """List the caller's jobs, newest first; none if the server asks for no credential."""
+        caller = CALLER.get()
 
-    @router.get("/v1/sequences/{job_id}")
+        def wanted(job: Job) -> bool:
+            # Callers without a credential share a name: the id of a job is its secret.
+            return caller.proven and caller.owns(job.owner) and query.wants(job)
+
+        found, below = jobs.page(wanted, size=query.page_size, below=query.below())
+        headers = {}
+        if below is not None:
+            url = request.url.include_query_params(page_token=query.token(below))
+            headers["Link"] = f'<{url.path}?{url.query}>; rel="next"'
+        body = await threads.run(_list_json, found)
+        return Response(body, media_type="application/json", headers=headers)
+
+    @router.post("/v1/sequences/{job_id}/cancel", operation_id="cancel_sequence")
+    async def cancel(job_id: str) -> SequenceJob:
+        """Stop a job, and keep the frames that are done. An ended job stays as it is."""
+        jobs.check_owner(job_id, CALLER.get())
+        return SequenceJob.of(await queue.cancel(job_id))
+
+    @router.get("/v1/sequences/{job_id}", operation_id="get_sequence")
     async def get_sequence(job_id: str) -> SequenceJob:
         """Get the state and the progress of a job."""
         jobs.check_owner(job_id, CALLER.get())
@@ -142,6 +187,7 @@ def sequence_routes(
 
     @router.get(
         "/v1/sequences/{job_id}/events",
+        operation_id="follow_sequence",
         response_class=StreamingResponse,
         responses={
             200: {
@@ -160,19 +206,23 @@ def sequence_routes(
         )
 
     @router.get(
-        "/v1/sequences/{job_id}/result", response_class=StreamingResponse, responses=_RESULT
+        "/v1/sequences/{job_id}/result",
+        operation_id="get_result",
+        response_class=StreamingResponse,
+        responses=_RESULT,
     )
     async def result(job_id: str, query: Annotated[ResultQuery, Query()]) -> Response:
         """Download the result. It is encoded while it is sent."""
         jobs.check_owner(job_id, CALLER.get())
         return await _result(jobs, job_id, query.format, threads)
 
-    @router.delete("/v1/sequences/{job_id}", status_code=204)
+    @router.delete("/v1/sequences/{job_id}", status_code=204, operation_id="delete_sequence")
     async def delete(job_id: str) -> None:
         """Cancel the job if it has not ended, and delete all its files."""
         jobs.check_owner(job_id, CALLER.get())
         await queue.delete(job_id)
 
+    router.include_router(frame_routes(jobs, threads, stopping))
     return router
 
 
@@ -185,6 +235,24 @@ def no_sequence_routes(why: str) -> APIRouter:
         raise NotReady(f"this server accepts no sequences: {why}")
 
     return router
+
+
+def _list_json(found: list[JobStatus]) -> bytes:
+    rows = (SequenceJob.of(status).model_dump_json() for status in found)
+    return f"[{','.join(rows)}]".encode()
+
+
+async def _check_repeated(
+    request: Request,
+    submission: Submission,
+    earlier: Job,
+    limits: UploadLimits,
+    threads: ThreadPool,
+) -> None:
+    """Raise KeyReused unless the request is the one that ``earlier`` was submitted by."""
+    submission.check(earlier, submission.body_sha256)
+    if submission.body_sha256 is None:
+        submission.check(earlier, await digest_of(request, limits, threads))
 
 
 async def _events(jobs: JobRegistry, job_id: str, stopping: asyncio.Event) -> AsyncIterator[str]:

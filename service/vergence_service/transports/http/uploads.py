@@ -164,6 +164,14 @@ async def receive_sequence(
     return digest.hexdigest()
 
 
+async def digest_of(request: Request, limits: UploadLimits, threads: ThreadPool) -> str:
+    """Receive a body without keeping it; return its SHA-256. Raises what receiving it raises."""
+    digest = hashlib.sha256()
+    async for chunk in _chunks(request, limits):
+        await threads.run(digest.update, chunk)
+    return digest.hexdigest()
+
+
 def _write(file: BinaryIO, chunk: bytes, digest: "hashlib._Hash") -> None:
     file.write(chunk)
     digest.update(chunk)
