@@ -69,7 +69,8 @@ async def test_a_key_whose_first_request_is_under_way_is_a_conflict(tmp_path: Pa
         reader, writer = await asyncio.open_connection(*server.http_address.split(":"))
         head = (
             f"POST /v1/sequences HTTP/1.1\r\nHost: {server.http_address}\r\n"
-            f'Content-Type: application/zip\r\nIdempotency-Key: "k"\r\nContent-Length: {len(ARCHIVE)}\r\n\r\n'
+            'Content-Type: application/zip\r\nIdempotency-Key: "k"\r\n'
+            f"Content-Length: {len(ARCHIVE)}\r\n\r\n"
         )
         writer.write(head.encode() + ARCHIVE[:100])
         await writer.drain()
