@@ -31,7 +31,9 @@ two principal points differ: the transform includes that difference.
 
 import hashlib
 import json
-from collections.abc import Mapping
+import os
+import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
@@ -195,6 +197,29 @@ def load_model_card(weights_dir: Path, name: str) -> ModelCard:
         cold_graphs=cold_graphs,
         cold_max_pixels=entry.get("cold_max_pixels", 0),
     )
+
+
+def user_models_dir() -> Path:
+    """Return the folder of models that the user of this machine has added; it may not exist."""
+    if sys.platform == "win32":
+        base = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
+    else:
+        base = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
+    return Path(base) / "vergence" / "models"
+
+
+def folder_of_model(name: str, folders: Sequence[Path]) -> Path:
+    """Return the first of ``folders`` whose manifest names the model, otherwise the first of all.
+
+    A manifest that cannot be read names no model: loading the model reports what is wrong.
+    """
+    for folder in folders:
+        try:
+            if name in json.loads((folder / MANIFEST_NAME).read_bytes())["models"]:
+                return folder
+        except (OSError, ValueError, KeyError, TypeError):
+            continue
+    return folders[0]
 
 
 def _checked_digest(path: Path, expected: str) -> bytes:

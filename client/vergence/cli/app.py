@@ -4,7 +4,7 @@ A command imports what it needs when it is called, so that ``--help`` answers at
 """
 
 import math
-from collections.abc import Callable, Coroutine
+from collections.abc import Coroutine
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
@@ -362,20 +362,23 @@ def _doctor(
         _await(examine_link(server, seconds, console))
 
 
-def _contributed(entry: metadata.EntryPoint) -> Callable[..., None]:
-    """Load the command of another package; if that fails, return a command that says why."""
+def _add_contributed(entry: metadata.EntryPoint) -> None:
+    """Add the command of another package; if it cannot be loaded, the command says why."""
     try:
-        command: Callable[..., None] = entry.load()
+        command = entry.load()
     except ModuleNotFoundError as error:
         missing = error.name
 
         def report() -> None:
             raise CliError(f"vergence {entry.name} needs {missing}, which is not installed")
 
-        return report
-    return command
+        command = report
+    if isinstance(command, typer.Typer):
+        app.add_typer(command, name=entry.name)
+    else:
+        app.command(entry.name)(command)
 
 
-# The server's command. Its module imports the server when the command is called.
+# Commands of the server and of the models. Their modules import what they need when called.
 for _entry in metadata.entry_points(group="vergence.commands"):
-    app.command(_entry.name)(_contributed(_entry))
+    _add_contributed(_entry)

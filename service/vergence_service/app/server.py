@@ -9,6 +9,7 @@ from typing import Any
 
 from prometheus_client import CollectorRegistry
 
+from vergence_proto.model_io import folder_of_model, user_models_dir
 from vergence_proto.stopping import STOP_SIGNALS, on_end_of_input, on_signals
 from vergence_proto.types import Delivery
 from vergence_service.app.http import serving_http
@@ -66,9 +67,11 @@ def make_model(settings: Settings) -> OnnxStereoModel | NativeStereoModel:
     Raises ManifestError if the manifest cannot be used, ProviderUnavailable if the engine or an
     execution provider is missing, and FileNotFoundError if there are no weights.
     """
+    name = settings.model.name
+    weights = settings.model.weights
     return load_model(
-        settings.model.weights or packaged_weights_dir(),
-        settings.model.name,
+        weights or folder_of_model(name, [packaged_weights_dir(), user_models_dir()]),
+        name,
         engine=settings.model.engine,
         providers=settings.model.providers,
         threads=settings.model.threads,

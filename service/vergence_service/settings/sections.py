@@ -95,7 +95,9 @@ class AdminSettings(Section):
 class ModelSettings(Section):
     name: str = Field(default="lite", description="model of the manifest")
     weights: Path | None = Field(
-        default=None, description="folder with a manifest.json; default: the installed weights"
+        default=None,
+        description="folder with a manifest.json; default: the installed weights, or what "
+        "`vergence models add` wrote",
     )
     providers: tuple[Literal["cpu", "cuda", "tensorrt", "openvino"], ...] = Field(
         default=("cpu",), min_length=1, description="execution providers in order of preference"
