@@ -14,6 +14,18 @@ root; else it is a proxy that shapes the bytes (``"link": "proxy"``). Per link:
 - ``epe_ratio_covered epe_ratio_all covered``: the end-point error of ``depth_at`` at the pose of
   the moment over that of a map of the moment, where a result saw the surface and everywhere.
 - ``depth_at_ms``: the time of one ``depth_at`` at 640x480.
+
+``--opens`` opens sessions over gRPC, HTTP and Zenoh (over TCP, without shared memory) instead:
+``opened`` of ``tried`` at round trips of 60, 150 and 300 ms, and at 8 Mbit/s.
+
+``--outages`` cuts the link for 3, 12, 20 and 60 s, kills the server, and changes the address of the
+client, in the middle of sessions over all three:
+
+- ``errors``: exceptions that reached the program.
+- ``reported_s``: from the cut until ``session.state`` showed it.
+- ``warm_again_s``: from the return of the link, or of the server, to the first warm result.
+- ``state_kept``: the memory lived on; ``same_bits``: the next result is what it would have been.
+- ``left``: tasks, threads and descriptors that are there after the sessions, and were not before.
 """
 
 import argparse
@@ -22,6 +34,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -44,6 +57,19 @@ from vergence_proto.datasets import open_source  # noqa: E402
 from vergence_proto.instruction_set import instruction_set  # noqa: E402
 
 SEQUENCE = REPOSITORY / "client/vergence/sample/room"
+GRPC_PORT, HTTP_PORT, ZENOH_PORT = 50051, 8000, 7447
+OPENINGS = {
+    "60 ms": LinkShape(delay_ms=30),
+    "150 ms": LinkShape(delay_ms=75),
+    "300 ms": LinkShape(delay_ms=150),
+    "8 Mbit/s": LinkShape(8, 30),
+}
+ADDRESSES = [
+    f"{scheme}://{SERVER_IP}:{port}"
+    for scheme, port in (("grpc", GRPC_PORT), ("http", HTTP_PORT), ("zenoh", ZENOH_PORT))
+]
+OUTAGES = ("3", "12", "20", "60", "killed", "moved")
+OUTAGE_LINK = LinkShape(50, 5, 2)
 LINKS = {
     "50": LinkShape(50, 5, 2),
     "20": LinkShape(20, 10, 5),
@@ -67,6 +93,7 @@ def python(prefix: Sequence[str], *arguments: str) -> "subprocess.Popen[str]":
         [*prefix, sys.executable, *arguments],
         cwd=REPOSITORY,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
+        stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
     )
@@ -83,6 +110,71 @@ def serving(place: Place, maps: Path) -> Iterator[str]:
             yield process.stdout.readline().split()[0]
         finally:
             process.terminate()
+
+
+def server_of_all(place: Place, maps: str) -> "subprocess.Popen[str]":
+    """Start a server on fixed ports, over all transports; return when it serves."""
+    process = python(
+        place.server,
+        *("-m", "tests.support.recorded_model", maps, place.host),
+        *(f"grpc.port={GRPC_PORT}", f"http.port={HTTP_PORT}", "zenoh.enabled=true"),
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline()
+    return process
+
+
+def opened(count: int) -> dict[str, Any]:
+    figures: dict[str, Any] = {}
+    for name, shape in OPENINGS.items():
+        figures[name] = {}
+        with tun_link(shape) as link:
+            place = Place(link.client, link.server, SERVER_IP)
+            with server_of_all(place, "recall") as server:
+                for address in ADDRESSES:
+                    plan = json.dumps({"server": address, "count": count})
+                    with python(place.client, "-m", "tests.support.link_openings", plan) as process:
+                        output, _ = process.communicate()
+                    row = json.loads(output)
+                    figures[name][address.partition(":")[0]] = row
+                    show(f"{name} {address}", row)
+                server.terminate()
+    return figures
+
+
+def outages(names: Sequence[str]) -> dict[str, Any]:
+    return {name: outage(name) for name in names}
+
+
+def outage(name: str) -> dict[str, Any]:
+    """Film through one outage: of so many seconds, "killed" or "moved"."""
+    with tun_link(OUTAGE_LINK) as link:
+        place = Place(link.client, link.server, SERVER_IP)
+        server = server_of_all(place, "recall")
+        plan = json.dumps({"servers": ADDRESSES})
+        with python(place.client, "-m", "tests.support.link_outages", plan) as process:
+            assert process.stdin is not None
+            assert process.stdout is not None
+            assert process.stdout.readline() == "live\n"
+            cut_s = return_s = time.monotonic()
+            if name == "moved":
+                link.move_client()
+            elif name == "killed":
+                server.kill()
+                server.wait()
+                server = server_of_all(place, "recall")
+                return_s = time.monotonic()
+            else:
+                link.cut(float(name))
+                return_s = cut_s + float(name)
+            process.stdin.write(f"{cut_s} {return_s}\n")
+            output, _ = process.communicate()
+        server.terminate()
+        server.wait()
+    rows: dict[str, Any] = json.loads(output)
+    for transport, row in rows.items():
+        show(f"{name} {transport}", row)
+    return rows
 
 
 def play(place: Place, plan: Plan) -> dict[str, Any]:
@@ -154,8 +246,16 @@ def main() -> None:
     parser.add_argument(
         "--link", choices=("tun", "proxy"), default="tun" if can_make_links() else "proxy"
     )
+    parser.add_argument("--opens", type=int, nargs="?", const=20, metavar="COUNT")
+    parser.add_argument("--outages", nargs="*", choices=OUTAGES)
     args = parser.parse_args()
-    args.json.write_text(json.dumps(run(args), indent=2))
+    if args.opens:
+        figures = opened(args.opens)
+    elif args.outages is not None:
+        figures = outages(args.outages or OUTAGES)
+    else:
+        figures = run(args)
+    args.json.write_text(json.dumps(figures, indent=2))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """A network that answers from a record, in the time that a GPU would take.
 
 So a benchmark of the way to the server measures the way, and not the model on this machine's CPU.
-``python -m`` this module serves it: RECORD.npz HOST [SETTING=VALUE...].
+``python -m`` this module serves it: RECORD.npz HOST [SETTING=VALUE...]. With "recall" as the
+record, it serves the tiny model of the tests, whose answers show its memory.
 """
 
 import asyncio
@@ -16,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tests.support.models import RecallModel
 from vergence_proto.model_io import ModelCard, load_model_card
 from vergence_proto.types import Plane, StereoFrame, StereoRig
 from vergence_service.app.server import running
@@ -98,7 +100,7 @@ def _thumbnail(image: NDArray[np.uint8]) -> NDArray[np.int16]:
     return cv2.resize(image[..., 1], _THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.int16)
 
 
-async def _serve(path: Path, host: str, flags: dict[str, str]) -> None:
+async def _serve(record: str, host: str, flags: dict[str, str]) -> None:
     stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
@@ -107,11 +109,12 @@ async def _serve(path: Path, host: str, flags: dict[str, str]) -> None:
             flags={"server.host": host, "batch.directory": jobs, "grpc.port": 0, "http.port": 0}
             | flags
         )
-        async with running(settings, RecordedModel(path)) as server:
+        model = RecallModel() if record == "recall" else RecordedModel(Path(record))
+        async with running(settings, model) as server:
             print(server.grpc_address, server.http_address, flush=True)  # noqa: T201
             await stop.wait()
 
 
 if __name__ == "__main__":
     _record, _host, *_flags = sys.argv[1:]
-    asyncio.run(_serve(Path(_record), _host, dict(each.split("=", 1) for each in _flags)))
+    asyncio.run(_serve(_record, _host, dict(each.split("=", 1) for each in _flags)))

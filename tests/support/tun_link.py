@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 CLIENT_IP, SERVER_IP = "10.77.0.1", "10.77.0.2"
+_MOVED_IP = "10.77.0.3"
 _TUNSETIFF = 0x400454CA
 _IFF_TUN, _IFF_NO_PI = 0x0001, 0x1000
 _MTU = 1500
@@ -106,6 +107,14 @@ class TunLink:
         self._process.stdin.write(f"{seconds}\n")
         self._process.stdin.flush()
 
+    def move_client(self) -> None:
+        """Give the client another address, as a headset gets that walks to another access point."""
+        name = self.client[-1]
+        device = f"vg{self._process.pid % 100_000}a"
+        _run("ip", "-n", name, "addr", "del", f"{CLIENT_IP}/24", "dev", device)
+        _run("ip", "-n", name, "addr", "add", f"{_MOVED_IP}/24", "dev", device)
+        _route(name, device, _MOVED_IP)
+
 
 def can_make_links() -> bool:
     """Return True if this process may make network namespaces and TUN devices."""
@@ -149,10 +158,14 @@ def _tun(name: str, namespace: str, ip: str) -> int:
     _run("ip", "link", "set", name, "netns", namespace)
     _run("ip", "-n", namespace, "addr", "add", f"{ip}/24", "dev", name)
     _run("ip", "-n", namespace, "link", "set", name, "mtu", str(_MTU), "txqueuelen", "1000", "up")
+    _route(namespace, name, ip)
+    return descriptor
+
+
+def _route(namespace: str, device: str, ip: str) -> None:
     # Every system has cubic; another default would make figures of two machines differ.
     net = ip.rpartition(".")[0] + ".0/24"
-    _run("ip", "-n", namespace, "route", "replace", net, "dev", name, "congctl", "cubic")
-    return descriptor
+    _run("ip", "-n", namespace, "route", "replace", net, "dev", device, "congctl", "cubic")
 
 
 def _carry(ends: tuple[int, int], shape: LinkShape) -> None:

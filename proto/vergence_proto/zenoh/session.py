@@ -28,6 +28,7 @@ Value = TypeVar("Value")
 # A lossless message that waits for a slow receiver holds a thread. The session has threads of its
 # own, because the event loop's default ones decode images and must stay free.
 _THREADS = 32
+_CLOSE_S = 0.3
 
 _DEFAULTS: dict[str, Any] = {
     # Connect only to configured endpoints.
@@ -115,11 +116,20 @@ class ZenohSession:
         self.id: str = str(self._session.zid())
 
     async def close(self) -> None:
-        """Close the session, and with it everything that it declared."""
-        # The interpreter does not exit while a session is open.
-        await self._in_thread(self._session.close)
+        """Close the session, and with it everything that it declared.
+
+        A session whose link is dead takes ten seconds to close, and a thread goes on with that.
+        """
         self._closed = True
+        # The interpreter does not exit while a session is open.
+        closing = asyncio.wrap_future(self._threads.submit(self._session.close))
         self._threads.shutdown(wait=False)
+        done, _ = await asyncio.wait({closing}, timeout=_CLOSE_S)
+        if done:
+            with suppress(zenoh.ZError):  # it is closed all the same
+                closing.result()
+        else:
+            closing.cancel()
 
     async def put(
         self, key: str, message: Message, *, attachment_id: str, may_drop: bool = False
