@@ -92,7 +92,7 @@ async def test_what_the_network_loses_is_found_out_and_gives_its_credit_back(way
         lossy as between,
         server_on(between.endpoint) as server,
         DepthClient(between.address) as client,
-        client.open_session(RIG, encoding=ImageEncoding.RAW, output=EXACT) as session,
+        client.open_session(RIG, encoding=ImageEncoding.RAW, output=EXACT, link="fixed") as session,
     ):
         stream = server.engine.streams.get(session.stream_id)
         for frame_id in range(1, 1 + session.credit):
