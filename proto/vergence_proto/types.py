@@ -281,6 +281,8 @@ class OutputFormat:
     map_step: int = 0
     """Send every first, second or fourth row and column: 1, 2 or 4. The client interpolates the
     others. 0: 2 for UINT16 and live sessions off this machine, else 1."""
+    deflate: bool = False
+    """Compress by deflate in place of zstd: slower, and available in browsers."""
 
     def resolved(self, *, small: bool = False) -> "OutputFormat":
         """Return the format with values for zeros: for small messages, or exact ones."""

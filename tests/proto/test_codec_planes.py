@@ -29,6 +29,12 @@ VALUES = st.one_of(st.floats(-5, 5000, width=32), st.just(float("nan")))
 PLANES = arrays.arrays(np.float32, SHAPES, elements=VALUES)
 BYTES_PLANES = arrays.arrays(np.uint8, SHAPES)
 ROUNDING = 1e-6  # of float32, some multiplications long
+COMPRESSIONS = [
+    pb.COMPRESSION_NONE,
+    pb.COMPRESSION_DELTA_ZSTD,
+    pb.COMPRESSION_DELTA_DEFLATE,
+]
+FORMATS = [OutputFormat(), OutputFormat(deflate=True), OutputFormat(compressed=False)]
 DENOMINATORS = st.sampled_from([16, 17, 24, 32, 50, 64])
 
 
@@ -55,8 +61,9 @@ class TestFixedPoint:
     @given(PLANES, DENOMINATORS)
     def test_compression_loses_nothing(self, plane: Plane, denominator: int) -> None:
         plain = over_the_wire(plane, OutputFormat(denominator=denominator, compressed=False))
-        packed = over_the_wire(plane, OutputFormat(denominator=denominator, compressed=True))
-        np.testing.assert_array_equal(packed.view(np.uint32), plain.view(np.uint32))
+        for deflate in (False, True):
+            packed = over_the_wire(plane, OutputFormat(denominator=denominator, deflate=deflate))
+            np.testing.assert_array_equal(packed.view(np.uint32), plain.view(np.uint32))
 
     @given(arrays.arrays(np.uint16, SHAPES))
     def test_every_stored_number_survives(self, stored: NDArray[np.uint16]) -> None:
@@ -84,9 +91,9 @@ class TestFloats:
         np.testing.assert_allclose(over_the_wire(plane, output), plane, rtol=2**-11, atol=2**-25)
 
 
-@given(BYTES_PLANES, st.booleans())
-def test_bytes_are_exact(plane: NDArray[np.uint8], compressed: bool) -> None:
-    back = bytes_plane_from_proto(bytes_plane_to_proto(plane, compressed=compressed))
+@given(BYTES_PLANES, st.sampled_from(COMPRESSIONS))
+def test_bytes_are_exact(plane: NDArray[np.uint8], compression: pb.Compression) -> None:
+    back = bytes_plane_from_proto(bytes_plane_to_proto(plane, compression=compression))
     np.testing.assert_array_equal(back, plane)
 
 
@@ -110,16 +117,16 @@ def test_the_compressed_bytes_are_those_the_proto_describes() -> None:
 
 
 class TestDamage:
-    @given(st.booleans(), st.data())
-    def test_a_cut_plane_is_an_error(self, compressed: bool, data: st.DataObject) -> None:
-        message = plane_to_proto(_slope(), OutputFormat(compressed=compressed))
+    @given(st.sampled_from(FORMATS), st.data())
+    def test_a_cut_plane_is_an_error(self, output: OutputFormat, data: st.DataObject) -> None:
+        message = plane_to_proto(_slope(), output)
         message.data = message.data[: data.draw(st.integers(0, len(message.data) - 1))]
         with pytest.raises(BadImage):
             plane_from_proto(message)
 
-    @pytest.mark.parametrize("compressed", [True, False], ids=["compressed", "plain"])
-    def test_bytes_too_many_are_an_error(self, compressed: bool) -> None:
-        message = plane_to_proto(_slope(), OutputFormat(compressed=compressed))
+    @pytest.mark.parametrize("output", FORMATS, ids=["zstd", "deflate", "plain"])
+    def test_bytes_too_many_are_an_error(self, output: OutputFormat) -> None:
+        message = plane_to_proto(_slope(), output)
         message.data += message.data
         with pytest.raises(BadImage, match="bytes"):
             plane_from_proto(message)

@@ -23,6 +23,7 @@ class TestSettings:
         st.booleans(),
         st.booleans(),
         st.sampled_from([1, 2, 4]),
+        st.booleans(),
     )
     def test_output_round_trip(
         self,
@@ -32,8 +33,12 @@ class TestSettings:
         confidence: bool,
         sigma: bool,
         map_step: int,
+        deflate: bool,
     ) -> None:
-        output = OutputFormat(encoding, denominator, compressed, confidence, sigma, map_step)
+        deflate = deflate and compressed
+        output = OutputFormat(
+            encoding, denominator, compressed, confidence, sigma, map_step, deflate=deflate
+        )
         assert codec.output_format_from_proto(codec.output_format_to_proto(output)) == output
 
     def test_an_empty_format_is_the_default(self) -> None:
@@ -84,7 +89,7 @@ class TestSettings:
             pytest.param(enums.AXES, pb.Axes, id="axes"),
             pytest.param(enums.DISTORTION, pb.Distortion, id="distortion"),
             pytest.param(enums.DELIVERY, pb.Delivery, id="delivery"),
-            pytest.param(enums.COMPRESSED, pb.Compression, id="compression"),
+            pytest.param(enums.COMPRESSION, pb.Compression, id="compression"),
             pytest.param(enums.ORIGIN, pb.Origin, id="origin"),
         ],
     )

@@ -37,10 +37,12 @@ DISPARITY_ENCODING = {
     pb.PLANE_ENCODING_FLOAT16: PlaneEncoding.FLOAT16,
     pb.PLANE_ENCODING_FLOAT32: PlaneEncoding.FLOAT32,
 }
-COMPRESSED = {
-    pb.COMPRESSION_UNSPECIFIED: True,
-    pb.COMPRESSION_NONE: False,
-    pb.COMPRESSION_DELTA_ZSTD: True,
+# (compressed, deflate) of an OutputFormat
+COMPRESSION = {
+    pb.COMPRESSION_UNSPECIFIED: (True, False),
+    pb.COMPRESSION_NONE: (False, False),
+    pb.COMPRESSION_DELTA_ZSTD: (True, False),
+    pb.COMPRESSION_DELTA_DEFLATE: (True, True),
 }
 ORIGIN = {
     pb.ORIGIN_UNSPECIFIED: Origin.WARM,

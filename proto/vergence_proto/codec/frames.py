@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from vergence_proto.codec.enums import (
-    COMPRESSED,
+    COMPRESSION,
     DELIVERY,
     DISPARITY_ENCODING,
     ORIGIN,
@@ -17,6 +17,7 @@ from vergence_proto.codec.planes import (
     bytes_plane_from_proto,
     bytes_plane_to_proto,
     check_denominator,
+    compression_of,
     plane_from_proto,
     plane_to_proto,
 )
@@ -195,7 +196,7 @@ def disparity_to_proto(
     if output.confidence and disparity.confidence is not None:
         bytes_plane_to_proto(
             np.ascontiguousarray(disparity.confidence[::step, ::step]),
-            compressed=output.compressed,
+            compression=compression_of(output),
             into=message.confidence,
         )
     if output.sigma and disparity.sigma_px is not None:
@@ -277,7 +278,7 @@ def output_format_to_proto(output: OutputFormat) -> pb.OutputFormat:
         encoding=number_of(DISPARITY_ENCODING, output.encoding),
         denominator=check_denominator(output.denominator),
         map_step=check_map_step(output.map_step),
-        compression=number_of(COMPRESSED, output.compressed),
+        compression=compression_of(output),
         confidence=output.confidence,
         sigma=output.sigma,
     )
@@ -290,11 +291,13 @@ def output_format_from_proto(message: pb.OutputFormat) -> OutputFormat:
     no such number.
     """
     exact = OutputFormat().resolved()
+    compressed, deflate = value_of(COMPRESSION, message.compression, "output compression")
     return OutputFormat(
         encoding=value_of(DISPARITY_ENCODING, message.encoding, "output encoding"),
         denominator=check_denominator(message.denominator or exact.denominator),
         map_step=check_map_step(message.map_step or exact.map_step),
-        compressed=value_of(COMPRESSED, message.compression, "output compression"),
+        compressed=compressed,
+        deflate=deflate,
         confidence=message.confidence,
         sigma=message.sigma,
     )

@@ -47,6 +47,7 @@ class Compression(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     COMPRESSION_UNSPECIFIED: _ClassVar[Compression]
     COMPRESSION_NONE: _ClassVar[Compression]
     COMPRESSION_DELTA_ZSTD: _ClassVar[Compression]
+    COMPRESSION_DELTA_DEFLATE: _ClassVar[Compression]
 
 class Delivery(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -95,6 +96,7 @@ PLANE_ENCODING_UINT8: PlaneEncoding
 COMPRESSION_UNSPECIFIED: Compression
 COMPRESSION_NONE: Compression
 COMPRESSION_DELTA_ZSTD: Compression
+COMPRESSION_DELTA_DEFLATE: Compression
 DELIVERY_UNSPECIFIED: Delivery
 DELIVERY_NEWEST: Delivery
 DELIVERY_EVERY: Delivery
