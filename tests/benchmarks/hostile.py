@@ -113,7 +113,7 @@ class Server:
 
     async def metric(self, name: str) -> float:
         async with httpx.AsyncClient() as client:
-            text = (await client.get(f"http://{self.addresses['http']}/metrics")).text
+            text = (await client.get(f"http://{self.addresses['admin']}/metrics")).text
         [value] = [line.split()[1] for line in text.splitlines() if line.startswith(f"{name} ")]
         return float(value)
 

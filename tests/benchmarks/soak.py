@@ -68,6 +68,7 @@ class Server:
     process: asyncio.subprocess.Process
     grpc_address: str
     http_address: str
+    admin_address: str
 
     async def sample(self) -> Sample:
         about = Path("/proc") / str(self.process.pid)
@@ -83,7 +84,7 @@ class Server:
 
     async def metrics(self) -> dict[str, float]:
         async with httpx.AsyncClient(timeout=60) as http:
-            text = (await http.get(f"http://{self.http_address}/metrics")).text
+            text = (await http.get(f"http://{self.admin_address}/metrics")).text
         lines = (line.rpartition(" ") for line in text.splitlines() if not line.startswith("#"))
         return {name: float(value) for name, _, value in lines}
 
@@ -105,10 +106,10 @@ async def started(folder: Path, *, leaky: bool) -> Server:
     )
     assert process.stdout is not None
     line = (await process.stdout.readline()).decode()
-    found = re.search(r"grpc=(\S+) http=(\S+)", line)
+    found = re.search(r"grpc=(\S+) http=(\S+).* admin=(\S+)", line)
     assert found, f"the server did not start: {(folder / 'log').read_text()[-2000:]}"
     await process.stdout.readline()  # every graph is loaded
-    return Server(process, found[1], found[2])
+    return Server(process, found[1], found[2], found[3])
 
 
 async def soak(minutes: float, seed: int, *, leaky: bool) -> dict[str, Any]:

@@ -14,7 +14,16 @@ import httpx
 import numpy as np
 from rich.console import Console
 
-from tests.support.http import disparities, ended, files_below, http_server, state_of, submit
+from tests.support.http import (
+    disparities,
+    ended,
+    files_below,
+    http_at,
+    http_server,
+    metrics_of,
+    state_of,
+    submit,
+)
 from tests.support.models import RecallModel
 from tests.support.polling import eventually
 from tests.support.sequences import make_frames, sequence_files, write_sequence, zip_bytes
@@ -47,7 +56,7 @@ async def killed_server(
         assert process.stdout is not None
         address = (await process.stdout.readline()).decode().strip()
         assert address, "the server did not start"
-        async with httpx.AsyncClient(base_url=f"http://{address}", timeout=PATIENCE_S) as client:
+        async with http_at(*address.split()) as client:
             yield client
     finally:
         process.kill()
@@ -84,7 +93,7 @@ def checkpoints_below(directory: Path) -> list[Path]:
 
 
 async def frames_stepped(client: httpx.AsyncClient) -> int:
-    text = (await client.get("/metrics")).text
+    text = await metrics_of(client)
     counts = re.findall(r"^vergence_frames_stepped_total\{.*\} (.+)$", text, re.MULTILINE)
     return round(sum(map(float, counts)))
 

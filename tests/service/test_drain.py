@@ -17,7 +17,7 @@ import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from tests.support.frames import frame_message, make_frame, open_message
-from tests.support.http import ended, http_to, submit
+from tests.support.http import ended, http_to, metrics_of, submit
 from tests.support.models import PacedModel, RecallModel
 from tests.support.polling import eventually_true
 from tests.support.sequences import make_frames, sequence_files, zip_bytes
@@ -96,7 +96,7 @@ async def test_http_reports_life_readiness_and_counts() -> None:
         async with httpx.AsyncClient(base_url=f"http://{server.http_address}") as http:
             assert (await http.get("/healthz")).json() == {"status": "alive"}
             assert (await http.get("/readyz")).status_code == 200
-            metrics = (await http.get("/metrics")).text.splitlines()
+            metrics = (await metrics_of(http)).splitlines()
             server.engine.drain(within_s=1)
             assert (await http.get("/readyz")).status_code == 503
             assert (await http.get("/healthz")).status_code == 200
@@ -209,7 +209,7 @@ async def test_a_job_keeps_its_progress_when_the_server_drains(tmp_path: Path) -
         assert (tmp_path / "jobs" / job_id / "checkpoint").exists()
     async with running_server(RecallModel(), **flags) as server, http_to(server) as http:
         assert (await ended(http, job_id))["state"] == "done"
-        metrics = (await http.get("/metrics")).text
+        metrics = await metrics_of(http)
     assert "vergence_sequence_frames_total 40.0" not in metrics, "all frames were stepped again"
 
 

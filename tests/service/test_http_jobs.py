@@ -19,6 +19,7 @@ from tests.support.http import (
     http_server,
     http_to,
     is_known,
+    metrics_of,
     reason_of,
     submit,
 )
@@ -68,8 +69,8 @@ async def test_a_sequence_that_keeps_killing_the_server_is_given_up(tmp_path: Pa
 
 
 async def test_prometheus_hears_of_sequences() -> None:
-    async def metrics_of(client: httpx.AsyncClient) -> dict[str, float]:
-        lines = (await client.get("/metrics")).text.splitlines()
+    async def of_sequences(client: httpx.AsyncClient) -> dict[str, float]:
+        lines = (await metrics_of(client)).splitlines()
         pairs = (line.rsplit(" ", 1) for line in lines if line.startswith("vergence_sequence"))
         return {name.removeprefix("vergence_"): float(value) for name, value in pairs}
 
@@ -78,12 +79,12 @@ async def test_prometheus_hears_of_sequences() -> None:
         with model.busy():
             jobs = [await submit(client, ARCHIVE) for _ in range(3)]
             await asyncio.to_thread(model.wait_until_entered)
-            waiting = await metrics_of(client)
+            waiting = await of_sequences(client)
         good = [await ended(client, job["id"]) for job in jobs]
         bad_frames = [*make_frames(2), make_frame(3, brightness=RAISES)]
         bad = await submit(client, zip_bytes(sequence_files(bad_frames)))
         assert (await ended(client, bad["id"]))["state"] == "failed"
-        after = await metrics_of(client)
+        after = await of_sequences(client)
     assert waiting['sequences{state="queued"}'] == 2
     assert waiting['sequences{state="running"}'] == 1
     assert waiting["sequence_disk_bytes"] > 0
@@ -121,7 +122,7 @@ async def test_no_result_makes_room_for_another_before_it_expires(
         assert "batch.disk_mib" in answer.text
         assert int(answer.headers["Retry-After"]) >= 1
         assert "refused" in caplog.text
-        assert "vergence_sequences_refused_total 1.0" in (await client.get("/metrics")).text
+        assert "vergence_sequences_refused_total 1.0" in (await metrics_of(client))
         for job in kept:
             assert len(await disparities(client, job["id"])) == 16
             assert datetime.fromisoformat(job["expires"]) > datetime.now(UTC) + timedelta(hours=23)

@@ -26,6 +26,7 @@ from tests.support.http import (
     http_server,
     http_to,
     is_known,
+    metrics_of,
     reason_of,
     submit,
 )
@@ -254,7 +255,7 @@ async def test_results_of_two_models_never_mix(tmp_path: Path) -> None:
             await asyncio.to_thread(other.wait_until_entered)
             assert not checkpoint.exists()  # should this server die now, nothing of it is continued
         job = await ended(http, job_id)
-        metrics = (await http.get("/metrics")).text
+        metrics = await metrics_of(http)
     assert job["state"] == "done"
     assert "vergence_sequence_frames_total 30.0" in metrics
 

@@ -7,7 +7,7 @@ import cv2
 import httpx
 import numpy as np
 
-from tests.support.http import http_to, reason_of
+from tests.support.http import http_to, metrics_of, reason_of
 from tests.support.models import RecallModel
 from tests.support.polling import eventually, eventually_true, turns
 from tests.support.server import running_server
@@ -29,7 +29,7 @@ async def test_pairs_beyond_the_queue_are_refused_with_a_time_to_come_back() -> 
             accepted.append(asyncio.create_task(http.post("/v1/pairs", files=pair_form())))
 
             async def is_full() -> bool:
-                return "vergence_pairs 2.0" in (await http.get("/metrics")).text
+                return "vergence_pairs 2.0" in (await metrics_of(http))
 
             await eventually_true(is_full)
             refusal = await http.post("/v1/pairs", files=pair_form())

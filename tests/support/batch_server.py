@@ -15,7 +15,7 @@ async def _serve(directory: str, step_s: float, port: int) -> None:
         "http__port": port,
     }
     async with running_server(PacedModel(step_s), **flags) as server:
-        print(server.http_address, flush=True)  # noqa: T201  the parent reads it
+        print(server.http_address, server.admin_address, flush=True)  # noqa: T201  the parent reads it
         await asyncio.to_thread(sys.stdin.read)  # until the parent closes its end
 
 

@@ -6,6 +6,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import httpx
 import numpy as np
@@ -22,11 +23,25 @@ ZIP = {"Content-Type": "application/zip"}
 PROTOBUF = {"Content-Type": PROTOBUF_TYPE}
 
 
+_ADMIN: WeakKeyDictionary[httpx.AsyncClient, str] = WeakKeyDictionary()
+
+
 @asynccontextmanager
 async def http_to(server: Running) -> AsyncIterator[httpx.AsyncClient]:
-    base = f"http://{server.http_address}"
-    async with httpx.AsyncClient(base_url=base, timeout=PATIENCE_S) as client:
+    async with http_at(server.http_address, server.admin_address) as client:
         yield client
+
+
+@asynccontextmanager
+async def http_at(address: str, admin_address: str) -> AsyncIterator[httpx.AsyncClient]:
+    async with httpx.AsyncClient(base_url=f"http://{address}", timeout=PATIENCE_S) as client:
+        _ADMIN[client] = admin_address
+        yield client
+
+
+async def metrics_of(client: httpx.AsyncClient) -> str:
+    """The metrics of the client's server, which has them on another port."""
+    return (await client.get(f"http://{_ADMIN[client]}/metrics")).text
 
 
 @asynccontextmanager

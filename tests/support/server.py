@@ -42,6 +42,7 @@ async def running_server(
             flags={
                 "grpc.port": 0,
                 "http.port": 0,
+                "admin.port": 0,
                 "batch.directory": jobs,
                 **{name.replace("__", "."): value for name, value in flags.items()},
             }

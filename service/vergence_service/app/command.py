@@ -91,7 +91,10 @@ def _end_after(seconds: float) -> None:
 
 def _announce(server: Running) -> None:
     zenoh = f" zenoh={server.zenoh.endpoint}" if server.zenoh else ""
-    _say(f"listening grpc={server.grpc_address} http={server.http_address}{zenoh}")
+    _say(
+        f"listening grpc={server.grpc_address} http={server.http_address}{zenoh}"
+        f" admin={server.admin_address}"
+    )
     server.loading.add_done_callback(_announce_ready)
 
 

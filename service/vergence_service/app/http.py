@@ -3,14 +3,13 @@
 import asyncio
 import logging
 import os
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, contextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
-
-from prometheus_client import CollectorRegistry
+from typing import Any
 
 from vergence_service.access.gate import Gate
 from vergence_service.app.security import host_names
@@ -45,6 +44,7 @@ class HttpTransport:
     jobs: (
         JobQueue | None
     )  # to be started when every graph is loaded; None: there is no disk for jobs
+    schema: Callable[[], dict[str, Any]]  # OpenAPI
 
 
 @asynccontextmanager
@@ -54,7 +54,6 @@ async def serving_http(
     engine: DepthEngine,
     unary: UnaryMethods,
     calls: OpenCalls,
-    registry: CollectorRegistry,
     *,
     connections: int,
     gate: Gate,
@@ -130,7 +129,6 @@ async def serving_http(
         app = make_http_app(
             version=version("vergence"),
             ready=lambda: engine.ready,
-            registry=registry,
             routes=routes,
         )
         server = await stack.enter_async_context(
@@ -149,7 +147,7 @@ async def serving_http(
                 trusted_proxies=settings.security.trusted_proxies,
             )
         )
-        yield HttpTransport(server, queue)
+        yield HttpTransport(server, queue, app.openapi)
 
 
 @contextmanager

@@ -34,6 +34,8 @@ def check_exposure(settings: Settings) -> None:
         exposed += [
             each or settings.server.host for each in (settings.grpc.host, settings.http.host)
         ]
+    if chosen.tls_cert is None or chosen.tokens is None:
+        exposed.append(settings.admin.host)
     for host in exposed:
         if not is_loopback(host):
             raise SettingsError(

@@ -12,6 +12,7 @@ from prometheus_client import CollectorRegistry
 from vergence_proto.model_io import folder_of_model, user_models_dir
 from vergence_proto.stopping import STOP_SIGNALS, on_end_of_input, on_signals
 from vergence_proto.types import Delivery
+from vergence_service.app.admin import serving_admin
 from vergence_service.app.http import serving_http
 from vergence_service.app.security import (
     check_exposure,
@@ -53,6 +54,7 @@ class Running:
 
     grpc_address: str
     http_address: str
+    admin_address: str
     engine: DepthEngine
     grpc: GrpcServer
     http: HttpServer
@@ -149,8 +151,8 @@ async def running(
 
     connections = affordable_connections(settings.limits.connections)
 
-    def open_calls() -> OpenCalls:
-        return OpenCalls(engine, limits=limits, clock=clock)
+    def open_calls(transport: str) -> OpenCalls:
+        return OpenCalls(engine, transport=transport, limits=limits, clock=clock)
 
     grpc_host = settings.grpc.host or settings.server.host
     http_host = settings.http.host or settings.server.host
@@ -159,7 +161,7 @@ async def running(
         threads,
         batcher,
         GrpcServer(
-            DepthServicer(unary, open_calls()),
+            DepthServicer(unary, open_calls("grpc")),
             host=grpc_host,
             port=settings.grpc.port,
             max_frame_bytes=max_frame_bytes,
@@ -173,13 +175,15 @@ async def running(
             http_host,
             engine,
             unary,
-            open_calls(),
-            registry,
+            open_calls("http"),
             connections=connections,
             gate=gate,
             certificate=certificate,
         ) as http,
-        serving_zenoh(settings, unary, open_calls(), gate) as zenoh,
+        serving_zenoh(settings, unary, open_calls("zenoh"), gate) as zenoh,
+        serving_admin(
+            settings, engine, registry, gate, certificate, schema=http.schema, clock=clock
+        ) as admin,
         _in_background(_sweep(streams)),
         _in_background(keep_current(gate, certificate, engine)),
     ):
@@ -192,6 +196,7 @@ async def running(
             yield Running(
                 format_address(grpc_host, grpc_server.port),
                 format_address(http_host, http.server.port),
+                format_address(settings.admin.host, admin.port),
                 engine,
                 grpc_server,
                 http.server,

@@ -378,6 +378,10 @@ class DepthEngine:
                     self._forget(stream, Origin.RESET_NON_FINITE)
                 raise
             stream.commit(frame.frame_id, result.state, frames_skipped=skipped)
+        now_s = self._clock()
+        stream.answers.append((now_s, now_s - arrived_s))
+        stream.last_origin = origin
+        stream.model_s += timings.model_s
         self.metrics.frames_stepped.labels(origin.name.lower()).inc()
         for stage in ("decode", "queue", "model"):
             self.metrics.stage_s.labels(stage).observe(getattr(timings, f"{stage}_s"))

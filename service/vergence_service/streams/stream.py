@@ -1,6 +1,7 @@
 """A stream: the configuration and the recurrent state of one client's sequence of frames."""
 
 import asyncio
+from collections import deque
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Protocol
@@ -98,6 +99,11 @@ class Stream:
     warned: bool = False  # the client knows that the stream will expire
     turn: asyncio.Lock = field(default_factory=asyncio.Lock)
     owner: Principal = LOCAL
+    transport: str = ""  # over which the client is attached
+    # For administrators: when the last frames were stepped and how old they were then, in seconds.
+    answers: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=200))
+    last_origin: Origin | None = None  # of the last step
+    model_s: float = 0.0  # time in the model, of all frames
 
     @property
     def key(self) -> str:

@@ -20,6 +20,7 @@ class PortTaken(OSError):
                 f"with --{transport}-port"
             )
         super().__init__(f"cannot listen on {address} ({transport}.port): {why}")
+        self.errno = error.errno
 
 
 class ExtraMissing(ImportError):

@@ -20,8 +20,14 @@ class OpenCalls:
     """Makes calls, keeps track of those that run, and ends them when the server drains."""
 
     def __init__(
-        self, engine: DepthEngine, *, limits: StreamLimits, clock: Callable[[], float]
+        self,
+        engine: DepthEngine,
+        *,
+        transport: str,
+        limits: StreamLimits,
+        clock: Callable[[], float],
     ) -> None:
+        self._transport = transport
         self.limits = limits
         self._engine = engine
         self._clock = clock
@@ -44,6 +50,7 @@ class OpenCalls:
             write,
             client=client,
             caller=caller,
+            transport=self._transport,
             limits=self.limits,
             clock=self._clock,
         )

@@ -52,6 +52,7 @@ class DepthCall:
         *,
         client: str,
         caller: Principal,
+        transport: str,
         limits: StreamLimits,
         clock: Callable[[], float],
     ) -> None:
@@ -60,6 +61,7 @@ class DepthCall:
         self._write = write
         self._client = client
         self._caller = caller
+        self._transport = transport
         self._limits = limits
         self._clock = clock
         self._outbox = Outbox(
@@ -123,6 +125,7 @@ class DepthCall:
         """Serve the call to its end. Raises the DepthError that it ends with, or ClientLost."""
         stream, resumed = await self._open()
         self._stream = stream
+        stream.transport = self._transport
         try:
             await self._write_in_time(pb.StreamDepthResponse(opened=self._opened(stream, resumed)))
             if self._error is None:

@@ -12,6 +12,7 @@ from vergence_service.transports.grpc.errors import Context, errors_as_status
 
 # A load balancer asks for the health without a credential.
 _OPEN = "/grpc.health.v1.Health/"
+_ADMINISTRATIVE = "/grpc.reflection."
 
 
 class Identity(grpc.aio.ServerInterceptor):  # type: ignore[type-arg] # of its stubs only
@@ -34,28 +35,37 @@ class Identity(grpc.aio.ServerInterceptor):  # type: ignore[type-arg] # of its s
         if isinstance(authorization, bytes):
             authorization = authorization.decode("latin-1")
         changed = {
-            kind: self._behind(behaviour, authorization)
+            kind: self._behind(
+                behaviour,
+                authorization,
+                handler_call_details.method.startswith(_ADMINISTRATIVE),
+            )
             for kind in ("unary_unary", "unary_stream", "stream_unary", "stream_stream")
             if (behaviour := getattr(handler, kind)) is not None
         }
         return handler._replace(**changed)
 
-    def _behind(self, behaviour: Callable[..., Any], authorization: str | None) -> Any:
+    def _behind(
+        self, behaviour: Callable[..., Any], authorization: str | None, administrative: bool
+    ) -> Any:
         async def answer(request: Any, context: Context) -> Any:
             async with errors_as_status(context):
-                self._admit(context, authorization)
+                self._admit(context, authorization, administrative)
             return await behaviour(request, context)
 
         async def answers(request: Any, context: Context) -> AsyncIterator[Any]:
             async with errors_as_status(context):
-                self._admit(context, authorization)
+                self._admit(context, authorization, administrative)
             async for each in behaviour(request, context):
                 yield each
 
         return answers if inspect.isasyncgenfunction(behaviour) else answer
 
-    def _admit(self, context: Context, authorization: str | None) -> None:
-        CALLER.set(self._gate.caller(authorization, _certificate_names(context)))
+    def _admit(self, context: Context, authorization: str | None, administrative: bool) -> None:
+        caller = self._gate.caller(authorization, _certificate_names(context))
+        if administrative and not self._gate.open:
+            caller.check_admin()
+        CALLER.set(caller)
 
 
 def _certificate_names(context: Context) -> Sequence[str]:

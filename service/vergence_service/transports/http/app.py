@@ -1,4 +1,4 @@
-"""The HTTP application and its server: sequences, pairs, streams, health and metrics."""
+"""The HTTP application and its server: sequences, pairs, streams and health."""
 
 import asyncio
 import socket
@@ -10,7 +10,6 @@ from typing import Any, Self
 import uvicorn
 from fastapi import APIRouter, FastAPI, Response
 from fastapi.openapi.utils import get_openapi
-from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
 from pydantic.json_schema import models_json_schema
 from starlette.types import ASGIApp
 
@@ -34,7 +33,6 @@ def make_http_app(
     *,
     version: str,
     ready: Callable[[], bool],
-    registry: CollectorRegistry,
     routes: Sequence[APIRouter],
 ) -> FastAPI:
     """Make the application from its routes."""
@@ -43,12 +41,12 @@ def make_http_app(
     )
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign] # as FastAPI documents it
     install_problems(app)
-    for router in (_health_routes(ready, registry), *routes):
+    for router in (_health_routes(ready), *routes):
         app.include_router(router)
     return app
 
 
-def _health_routes(ready: Callable[[], bool], registry: CollectorRegistry) -> APIRouter:
+def _health_routes(ready: Callable[[], bool]) -> APIRouter:
     router = APIRouter(tags=["health"])
 
     @router.get("/healthz")
@@ -62,15 +60,6 @@ def _health_routes(ready: Callable[[], bool], registry: CollectorRegistry) -> AP
         if not ready():
             response.status_code = 503
         return {"status": "ready" if ready() else "not ready"}
-
-    @router.get(
-        "/metrics",
-        response_class=Response,
-        responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
-    )
-    async def metrics() -> Response:
-        """Get the metrics, in the format of Prometheus."""
-        return Response(generate_latest(registry), media_type=CONTENT_TYPE_LATEST)
 
     return router
 
@@ -101,13 +90,14 @@ class _Uvicorn(uvicorn.Server):
 class HttpServer:
     """Serves the app as long as its context lasts.
 
-    At the end, it sets ``stopping``, ends ``calls``, and waits for the answers that are being sent.
+    At the end, it sets ``stopping``, ends ``calls``, if it has any, and waits for the answers that
+    are being sent.
     """
 
     def __init__(
         self,
         app: ASGIApp,
-        calls: OpenCalls,
+        calls: OpenCalls | None,
         *,
         listening: socket.socket,
         limits: ConnectionLimits,
@@ -144,12 +134,14 @@ class HttpServer:
         return self
 
     async def __aexit__(self, *exc_info: object) -> None:
-        await self._calls.drain(within_s=0)
+        if self._calls is not None:
+            await self._calls.drain(within_s=0)
         await self._finish(within_s=_FINISH_S)
 
     async def drain(self, *, within_s: float) -> None:
         """Wait until all calls end; after ``within_s``, answer what they have sent and end them."""
-        await self._calls.drain(within_s=within_s)
+        if self._calls is not None:
+            await self._calls.drain(within_s=within_s)
         await self._finish(within_s=FINISHING_SHARE * within_s)
 
     async def _finish(self, *, within_s: float) -> None:

@@ -11,16 +11,20 @@ from dataclasses import dataclass
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import cookie_parser
+from starlette.responses import RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from vergence_proto.errors import BadShape, DepthError, Forbidden
 from vergence_proto.http_records import PROTOBUF_TYPE
 from vergence_service.access.gate import Gate
 from vergence_service.transports.callers import CALLER
+from vergence_service.transports.http.admin import LOGIN, Logins
 from vergence_service.transports.http.errors import refusal_of
 
 # Probes ask for these by any name and without a credential.
 _OPEN_PATHS = {"/healthz", "/readyz"}
+_LOGIN_PATHS = {LOGIN, "/assets/page.css"}
 _PROTOBUF_PATHS = ("/v1/streams", "/v1/methods/")
 _HEADERS: Mapping[str, str] = {
     "X-Content-Type-Options": "nosniff",
@@ -64,10 +68,13 @@ class HostNames:
 class Border:
     """An ASGI application that lets only allowed requests pass to another one."""
 
-    def __init__(self, app: ASGIApp, *, gate: Gate, hosts: HostNames) -> None:
+    def __init__(
+        self, app: ASGIApp, *, gate: Gate, hosts: HostNames, logins: Logins | None = None
+    ) -> None:
         self._app = app
         self._gate = gate
         self._hosts = hosts
+        self._logins = logins  # for the administrator's listener
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request, or refuse it with problem details."""
@@ -86,7 +93,10 @@ class Border:
             if scope["path"] not in _OPEN_PATHS:
                 self._check(scope)
         except DepthError as error:
-            await refusal_of(error)(scope, receive, send_with_headers)
+            answer: Response = refusal_of(error)
+            if self._logins is not None and _is_browser(scope):
+                answer = RedirectResponse(LOGIN, status_code=303)
+            await answer(scope, receive, send_with_headers)
         else:
             await self._app(scope, receive, send_with_headers)
 
@@ -94,12 +104,23 @@ class Border:
         headers = Headers(scope=scope)
         self._hosts.check_host(headers.get("host", ""))
         self._hosts.check_page(headers)
+        authorization = headers.get("authorization")
+        if self._logins is not None:
+            if scope["path"] not in _LOGIN_PATHS:
+                cookies = cookie_parser(headers.get("cookie", ""))
+                scope["caller"] = self._logins.caller(authorization, cookies)
+            return
         names = scope.get("state", {}).get("certificate_names", ())
-        CALLER.set(self._gate.caller(headers.get("authorization"), names))
+        CALLER.set(self._gate.caller(authorization, names))
         if scope["method"] == "POST" and scope["path"].startswith(_PROTOBUF_PATHS):
             kind = headers.get("content-type", "").partition(";")[0].strip().lower()
             if kind != PROTOBUF_TYPE:
                 raise BadShape(f"expected a body of {PROTOBUF_TYPE}, got {kind[:100]!r}")
+
+
+def _is_browser(scope: Scope) -> bool:
+    """Return True for a page that a person asks for."""
+    return scope["method"] == "GET" and "text/html" in Headers(scope=scope).get("accept", "")
 
 
 def _name_of(host: str) -> str:
