@@ -93,7 +93,7 @@ async def test_http_reports_life_readiness_and_counts() -> None:
         await call.ask(frame_message(make_frame(1)))
         late = frame_message(make_frame(1))
         await call.ask(late)
-        async with httpx.AsyncClient(base_url=f"http://{server.http_address}") as http:
+        async with http_to(server) as http:
             assert (await http.get("/healthz")).json() == {"status": "alive"}
             assert (await http.get("/readyz")).status_code == 200
             metrics = (await metrics_of(http)).splitlines()
