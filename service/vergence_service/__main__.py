@@ -47,8 +47,8 @@ def serve(
     Every setting is also an environment variable (VERGENCE_GRPC__PORT) and a key of the file;
     --print-config lists them. Flags win over variables, and variables over the file. When live
     streams are served, it prints one line: "listening grpc=HOST:PORT http=HOST:PORT", with Zenoh
-    also " zenoh=ENDPOINT", and " admin=HOST:PORT". Lossless streams, pairs and sequences then wait
-    for the larger graphs that they need, until it prints "ready".
+    also " zenoh=ENDPOINT". Lossless streams, pairs and sequences then wait for the larger graphs
+    that they need, until it prints "ready" and the address for administrators.
     """
     flags: dict[str, Any] = {
         "grpc.port": grpc_port,

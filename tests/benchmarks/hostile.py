@@ -142,7 +142,9 @@ async def serving(zenoh_endpoint: str | None) -> AsyncIterator[Server]:
             words = (await process.stdout.readline()).decode().split()
             addresses = dict(word.split("=", 1) for word in words if "=" in word)
             assert "grpc" in addresses, (folder / "log").read_text()
-            assert b"ready" in await process.stdout.readline()
+            ready = (await process.stdout.readline()).decode()
+            assert "ready" in ready
+            addresses["admin"] = ready.strip().rpartition("admin=")[2]
             yield Server(process, folder, addresses)
         finally:
             if process.returncode is None:

@@ -106,10 +106,11 @@ async def started(folder: Path, *, leaky: bool) -> Server:
     )
     assert process.stdout is not None
     line = (await process.stdout.readline()).decode()
-    found = re.search(r"grpc=(\S+) http=(\S+).* admin=(\S+)", line)
+    found = re.search(r"grpc=(\S+) http=(\S+)", line)
     assert found, f"the server did not start: {(folder / 'log').read_text()[-2000:]}"
-    await process.stdout.readline()  # every graph is loaded
-    return Server(process, found[1], found[2], found[3])
+    ready = (await process.stdout.readline()).decode()  # every graph is loaded
+    admin_address = ready.strip().rpartition("admin=")[2]
+    return Server(process, found[1], found[2], admin_address)
 
 
 async def soak(minutes: float, seed: int, *, leaky: bool) -> dict[str, Any]:

@@ -17,10 +17,9 @@ import pytest
 from tests.docs.pages import PAGES, ROOT, blocks_of, commands_of
 
 # The ports that pages name; each run has a server of its own on free ones.
-_PORTS = {"grpc": "50051", "http": "8000", "zenoh": "7447", "admin": "8001"}
+_PORTS = {"grpc": "50051", "http": "8000", "zenoh": "7447"}
 _LISTENING = re.compile(
     r"listening grpc=\S+:(?P<grpc>\d+) http=\S+:(?P<http>\d+)(?: zenoh=\S+:(?P<zenoh>\d+))?"
-    r" admin=\S+:(?P<admin>\d+)"
 )
 _PATIENCE_S = 100.0
 _ON_FREE_PORTS = ("--grpc-port", "0", "--http-port", "0")

@@ -155,7 +155,7 @@ def test_the_process_reports_its_addresses_and_ends_cleanly_on_a_signal(
         word, *addresses = process.stdout.readline().split()
         assert word == "listening"
         ports = dict(address.split("=127.0.0.1:") for address in addresses)
-        assert set(ports) == {"grpc", "http", "admin"}
+        assert set(ports) == {"grpc", "http"}
         ready = httpx.get(f"http://127.0.0.1:{ports['http']}/readyz")
         assert ready.json() == {"status": "ready"}
         os.kill(process.pid, number)

@@ -91,16 +91,13 @@ def _end_after(seconds: float) -> None:
 
 def _announce(server: Running) -> None:
     zenoh = f" zenoh={server.zenoh.endpoint}" if server.zenoh else ""
-    _say(
-        f"listening grpc={server.grpc_address} http={server.http_address}{zenoh}"
-        f" admin={server.admin_address}"
-    )
-    server.loading.add_done_callback(_announce_ready)
+    _say(f"listening grpc={server.grpc_address} http={server.http_address}{zenoh}")
+    server.loading.add_done_callback(partial(_announce_ready, server.admin_address))
 
 
-def _announce_ready(loading: asyncio.Task[None]) -> None:
+def _announce_ready(admin_address: str, loading: asyncio.Task[None]) -> None:
     if not loading.cancelled() and loading.exception() is None:
-        _say("ready: every graph is loaded")
+        _say(f"ready: every graph is loaded; admin={admin_address}")
 
 
 def _say(line: str) -> None:
