@@ -204,3 +204,55 @@ def written(model: ModelProto, path: Path) -> Path:
     onnx.checker.check_model(model, full_check=True)
     onnx.save(model, path)
     return path
+
+
+FLOW_CELL_PX = 4
+REACH_PX = 6  # an iteration looks this far to either side
+
+
+def refining(iterations: int, *, flow: bool = True) -> ModelProto:
+    """A network that refines a flow, as RAFT-Stereo with flow_init: fewer iterations need one.
+
+    The last iteration compares blocks close to the disparity that it is given. If there is one
+    before, it searches everything, in the pixels of both views at half the size.
+    """
+    graph = Graph()
+    left, right = (graph.brightness(each, BYTES) for each in ("image1", "image2"))
+    if iterations > 1:
+        halves = []
+        for each in (left, right):
+            small = graph.add("AveragePool", each, kernel_shape=[2, 2], strides=[2, 2])
+            halves.append(small)
+        coarse = graph.match(halves, DISPARITIES // 2)
+        twice = graph.add("Resize", coarse, "", graph.constant([1, 1, 2, 2]), mode="nearest")
+        start = graph.add("Mul", twice, graph.constant(2))
+    else:
+        first, last = (graph.constant([each], np.int64) for each in (0, 1))
+        x = graph.add("Slice", "flow_init", first, last, graph.constant([1], np.int64))
+        scales = graph.constant([1, 1, FLOW_CELL_PX, FLOW_CELL_PX])
+        large = graph.add("Resize", x, "", scales, mode="nearest")
+        start = graph.add("Round", graph.add("Mul", large, graph.constant(-FLOW_CELL_PX)))
+    columns = graph.constant(np.arange(WIDTH)[None, None, None, :].repeat(HEIGHT, axis=2))
+    seen_at = graph.add("Sub", columns, start)
+    costs = []
+    for step in range(-REACH_PX, REACH_PX + 1):
+        at = graph.add("Sub", seen_at, graph.constant(step))
+        at = graph.add("Clip", at, graph.constant(0), graph.constant(WIDTH - 1))
+        index = graph.add("Cast", at, to=TensorProto.INT64)
+        there = graph.add("GatherElements", right, index, axis=3)
+        costs.append(graph.add("Abs", graph.add("Sub", left, there)))
+    cost = graph.add("Concat", *costs, axis=1)
+    pooled = graph.add(
+        "AveragePool", cost, kernel_shape=[7, 7], pads=[3, 3, 3, 3], count_include_pad=1
+    )
+    best = graph.add("Cast", graph.add("ArgMin", pooled, axis=1), to=TensorProto.FLOAT)
+    found = graph.add("Add", start, graph.add("Sub", best, graph.constant(REACH_PX)))
+    unused = graph.add("Mul", "flow_init", graph.constant(0))  # exporters keep all inputs
+    nothing = graph.add("ReduceSum", unused, keepdims=1)
+    graph.give("flow_up", graph.add("Sub", nothing, found))
+    image: Shape = [1, 3, HEIGHT, WIDTH]
+    cells: Shape = [1, 2, HEIGHT // FLOW_CELL_PX, WIDTH // FLOW_CELL_PX]
+    return graph.model(
+        {"image1": image, "image2": image, "flow_init": cells},
+        {"flow_up": [1, 1, HEIGHT, WIDTH]},
+    )

@@ -21,6 +21,7 @@ from vergence_models.foreign.files import (
 )
 from vergence_models.foreign.guess import Given, family_of, images_of, outputs_of
 from vergence_models.foreign.proof import (
+    WARM_LOSS,
     Proof,
     differences,
     found_range_px,
@@ -28,6 +29,7 @@ from vergence_models.foreign.proof import (
     prove,
     proven_flow,
     texture_size,
+    warm_shares,
 )
 from vergence_models.foreign.textures import scene
 from vergence_models.foreign.trial import Network, Trial
@@ -66,41 +68,41 @@ def add_model(
     read_manifest(folder)
     with TemporaryDirectory() as made:
         networks: dict[int, Path] = {}
-        contract: Contract | None = None
-        for count, path in sorted(paths.items()):
+        added: Added | None = None
+        # The graph with the most iterations matches from nothing; it decides the contract.
+        for count, path in sorted(paths.items(), reverse=True):
             model = read_graph(path)
             networks[count] = write_network(model, Path(made) / f"{count}.onnx")
-            if contract is None:
-                like = family_of(model, path.stem, given)
-                contract, proof, changed, known = _contract_of(
-                    model, networks[count], given, like, unproven
-                )
+            like = family_of(model, path.stem, given)
+            if added is None:
+                largest = networks[count]
+                added = _guessed(name, model, largest, given, like, unproven)
             else:
-                guess = images_of(model, given, like)
-                _check_same(guess.contract, path, contract, networks[count], unproven)
-        assert contract is not None
+                guess = images_of(model, given, like).contract
+                _check_same(guess, path, added.contract, networks[count], largest, unproven)
+        assert added is not None
         write_model(
             folder,
             name,
-            contract,
+            added.contract,
             networks,
-            like=like,
+            like=added.like,
             files={str(count): path.name for count, path in paths.items()},
             proven=not unproven,
         )
-    return Added(name, contract, like, proof, tuple(changed), known)
+    return added
 
 
-def _contract_of(
-    model: ModelProto, path: Path, given: Given, like: str | None, unproven: bool
-) -> tuple[Contract, Proof | None, list[str], bool]:
+def _guessed(
+    name: str, model: ModelProto, path: Path, given: Given, like: str | None, unproven: bool
+) -> Added:
     guess = images_of(model, given, like)
     if given.warm_start is True and guess.contract.warm_start is None:
         raise ContractError("the graph has no input for an initial flow, so it starts cold only")
     network = Network(path)
     contract = outputs_of(guess.contract, network, given)
     if unproven:
-        return contract, None, [], guess.pixels_known
+        return Added(name, contract, like, None, (), guess.pixels_known)
     proof = prove(contract, network, search_pixels=not guess.pixels_known)
     wrong = differences(contract, proof)
     # The textures may correct a guess. What the user says is refused if it is wrong.
@@ -114,24 +116,33 @@ def _contract_of(
     if refused or proof.contract is None:
         raise ContractError("; ".join(refused or wrong))
     contract = proof.contract
-    if contract.warm_start is not None:
+    if contract.recurrent:
         contract = proven_flow(contract, network)
     range_px = found_range_px(contract, network, contract.max_disparity_px)
     _check_range(range_px, given.max_disparity_px)
     contract = replace(contract, max_disparity_px=range_px)
-    return contract, proof, wrong, guess.pixels_known
+    return Added(name, contract, like, proof, tuple(wrong), guess.pixels_known)
 
 
 def _check_same(
-    guess: Contract, path: Path, contract: Contract, network_path: Path, unproven: bool
+    guess: Contract, path: Path, contract: Contract, network: Path, largest: Path, unproven: bool
 ) -> None:
-    same = (guess.left, guess.right, guess.size) == (contract.left, contract.right, contract.size)
-    if not same:
+    """Check a graph with fewer iterations, warm if it can start warm."""
+    if (guess.left, guess.right, guess.size) != (contract.left, contract.right, contract.size):
         raise ContractError(f"{path.name} has other inputs or another size than the first graph")
-    if not unproven:
-        seen = observe(contract, Network(network_path))
-        if not seen.matched:
-            raise ContractError(f"{path.name}: no match: the output is {seen.words} of disparity")
+    if unproven:
+        return
+    if contract.recurrent:
+        cold, warm = warm_shares(contract, Network(network), start=Network(largest))
+        if warm < cold - WARM_LOSS:
+            raise ContractError(
+                f"{path.name}: warm start: {100 * warm:.0f} % of the pixels are right from the "
+                f"last disparity, and {100 * cold:.0f} % before"
+            )
+        return
+    seen = observe(contract, Network(network))
+    if not seen.matched:
+        raise ContractError(f"{path.name}: no match: the output is {seen.words} of disparity")
 
 
 def _check_range(found_px: int, wanted_px: int | None) -> None:
@@ -169,14 +180,19 @@ def check_model(folder: Path, name: str) -> Added:
         raise ManifestError(f"{name} was exported, not added: its export has checked it")
     about = entry["foreign"]
     contract = Contract.from_json(about["contract"])
-    proof: Proof | None = None
-    for count, (before, stage, after) in sorted(card.graphs.items()):
-        network = Network(stage[0])
-        _check_stored(contract, network, before[0], after[0])
-        proof = prove(contract, network)
-        wrong = differences(contract, proof)
-        if wrong:
-            raise ContractError(f"{name}, graph {count}: {'; '.join(wrong)}")
-        found = found_range_px(contract, network, contract.max_disparity_px)
-        _check_range(found, contract.max_disparity_px)
+    (before, (largest, *_), after), *others = (
+        stages for _, stages in sorted(card.graphs.items(), reverse=True)
+    )
+    network = Network(largest)
+    _check_stored(contract, network, before[0], after[0])
+    proof = prove(contract, network)
+    if wrong := differences(contract, proof):
+        raise ContractError(f"{name}: {'; '.join(wrong)}")
+    if contract.recurrent and contract.warm_start and proven_flow(contract, network) != contract:
+        flow = contract.warm_start.input
+        raise ContractError(f"{name}: sign: {flow} is right with the other one")
+    found = found_range_px(contract, network, contract.max_disparity_px)
+    _check_range(found, contract.max_disparity_px)
+    for _, stage, _ in others:
+        _check_same(contract, stage[0], contract, stage[0], largest, unproven=False)
     return Added(name, contract, about.get("like"), proof, ())

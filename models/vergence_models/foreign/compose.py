@@ -41,7 +41,9 @@ _MATRIX: tuple[int, Shape] = (TensorProto.FLOAT, ["B", 4, 4])
 def state_of(contract: Contract) -> tuple[StateTensor, ...]:
     """The recurrent state of a model with this contract."""
     warm = contract.warm_start
-    return () if warm is None else (StateTensor("disparity", channels=1, scale=warm.scale),)
+    if warm is None or not warm.used:
+        return ()
+    return (StateTensor("disparity", channels=1, scale=warm.scale),)
 
 
 def renamed(network: ModelProto, prefix: str) -> ModelProto:
@@ -59,8 +61,9 @@ def graph_before(contract: Contract) -> ModelProto:
     if contract.sigma == "left-right":
         flipped = {LEFT: _mirror(graph, views[RIGHT], 3), RIGHT: _mirror(graph, views[LEFT], 3)}
         _feed(graph, contract, flipped, MIRRORED, outputs)
-    if contract.warm_start is not None:
-        [tensor] = state_of(contract)
+    if contract.warm_start is not None and not contract.recurrent:
+        _feed_nothing(graph, contract, views[LEFT], outputs)
+    for tensor in state_of(contract):
         inputs |= {
             UVD_CURR_FROM_PREV: _MATRIX,
             tensor.input_name: (TensorProto.FLOAT, ["B", 1, "h", "w"]),
@@ -77,8 +80,7 @@ def graph_after(contract: Contract) -> ModelProto:
     found = _disparity_of(graph, contract, NETWORK, inputs)
     graph.returns(DISPARITY, found)
     graph.returns(SIGMA, _sigma_of(graph, contract, found, inputs))
-    if contract.warm_start is not None:
-        [tensor] = state_of(contract)
+    for tensor in state_of(contract):
         scale = tensor.scale
         # The pixel in the middle of each cell. A mean would invent surfaces at every edge.
         starts, steps = graph.integers([scale // 2] * 2), graph.integers([scale] * 2)
@@ -147,6 +149,23 @@ def _feed(
             kind, shape = outputs[prefix + contract.left]
             give(name, half, contract.channels)
             outputs[prefix + name] = kind, [f"half_{d}" if d in ("x", "y") else d for d in shape]
+
+
+def _feed_nothing(
+    graph: GraphBuilder, contract: Contract, view: str, outputs: dict[str, tuple[int, Shape]]
+) -> None:
+    """An initial flow of zeros: the graph starts as it does without one."""
+    warm = contract.warm_start
+    assert warm is not None
+    batch = graph.add("Shape", view, start=0, end=1)
+    size = graph.add("Shape", view, start=2, end=4)
+    cells = graph.add("Div", size, graph.integers([warm.scale]))
+    shape = graph.add("Concat", batch, graph.integers([warm.channels]), cells, axis=0)
+    zeros = graph.add("Expand", graph.floats(0), shape)
+    prefixes = (NETWORK, MIRRORED) if contract.sigma == "left-right" else (NETWORK,)
+    for prefix in prefixes:
+        graph.returns(prefix + warm.input, zeros)
+        outputs[prefix + warm.input] = TensorProto.FLOAT, ["B", warm.channels, "fy", "fx"]
 
 
 def _feed_flow(

@@ -39,6 +39,7 @@ class WarmStart:
     channels: int  # 2: (x, y) of a flow; 1: a disparity
     scale: int  # pixels of the image per cell of the input
     factor: float  # value of the input for each pixel of disparity at the graph's width
+    used: bool = True  # False: the input is always zero, and the model has no memory
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +80,12 @@ class Contract:
         """Sizes of steps are multiples of this number."""
         if self.size is None:
             return self.multiple_of
-        return self.warm_start.scale if self.warm_start else 1
+        return self.warm_start.scale if self.recurrent and self.warm_start else 1
+
+    @property
+    def recurrent(self) -> bool:
+        """True if a step starts from the disparity of the one before."""
+        return self.warm_start is not None and self.warm_start.used
 
     def to_json(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
@@ -120,5 +126,5 @@ class Contract:
         if self.warm_start:
             warm = self.warm_start
             about = f"{warm.input}, 1/{warm.scale} of the size, {warm.factor:g} for each px"
-            rows.append(("warm start", about))
+            rows.append(("warm start", about if warm.used else f"no: {warm.input} is zero"))
         return rows

@@ -92,7 +92,8 @@ def images_of(model: ModelProto, given: Given, like: str | None) -> Guess:
             "export the graph without these inputs"
         )
     if flows:
-        contract = replace(contract, warm_start=_flow(flows[0], images, published))
+        warm = replace(_flow(flows[0], images, published), used=given.warm_start is not False)
+        contract = replace(contract, warm_start=warm)
     return Guess(contract, given.pixels is not None or published is not None)
 
 

@@ -21,7 +21,7 @@ _COMMON_FIRST = ("imagenet", "0..255", "0..1", "-1..1")
 _AS_GOOD = 0.02  # difference of scores
 _MUCH_BETTER = 0.1
 _RANGES = (16, 24, 32, 48, 64, 96, 128, 160, 192, 256, 320, 384)
-_WARM_LOSS = 0.05  # share of pixels that a warm step of the same pair may lose
+WARM_LOSS = 0.05  # share of pixels that a warm step of the same pair may lose
 _NEAR_THE_END = 0.9  # of a range: the shift that is tried
 
 
@@ -165,17 +165,23 @@ def prove(contract: Contract, network: Network, *, search_pixels: bool = False) 
     return Proof(None, own, ())
 
 
-def warm_share(contract: Contract, network: Network) -> tuple[float, float]:
-    """Return the share of right pixels of a cold step, and of a warm one of the same pair."""
-    trial = Trial(replace(contract, sigma="constant"), network)
-    shares: list[tuple[float, float]] = []
+def warm_shares(
+    contract: Contract, network: Network, *, start: Network | None = None
+) -> tuple[float, float]:
+    """Return the share of right pixels of a cold step, and of a warm one of the same pair.
+
+    ``start`` takes the cold step; by default the same network.
+    """
+    contract = replace(contract, sigma="constant")
+    warm = Trial(contract, network)
+    cold = warm if start is None else Trial(contract, start)
+    shares = []
     for each in scenes_for(contract):
-        cold = trial.step(each.left, each.right)
-        warm = trial.step(each.left, each.right, cold)
-        first, second = (_share(step[DISPARITY][0], each) for step in (cold, warm))
-        shares.append((first, second))
-    colds, warms = zip(*shares, strict=True)
-    return float(np.mean(colds)), float(np.mean(warms))
+        first = cold.step(each.left, each.right)
+        second = warm.step(each.left, each.right, first)
+        shares.append([_share(step[DISPARITY][0], each) for step in (first, second)])
+    before, after = np.mean(shares, axis=0)
+    return float(before), float(after)
 
 
 def proven_flow(contract: Contract, network: Network) -> Contract:
@@ -189,11 +195,11 @@ def proven_flow(contract: Contract, network: Network) -> Contract:
     cold = 0.0
     for factor in (warm.factor, -warm.factor):
         each = replace(contract, warm_start=replace(warm, factor=factor))
-        cold, share = warm_share(each, network)
+        cold, share = warm_shares(each, network)
         if best is None or share > best[0] + 0.02:
             best = share, each
     assert best is not None
-    if best[0] < cold - _WARM_LOSS:
+    if best[0] < cold - WARM_LOSS:
         raise ContractError(
             f"warm start: {100 * best[0]:.0f} % of the pixels are right from the last disparity in "
             f"{warm.input}, and {100 * cold:.0f} % from nothing; use --no-warm-start"
