@@ -1,4 +1,4 @@
-"""Guess the contract of a graph from its names, its shapes, and the shapes of what it returns."""
+"""GuessedImages the contract of a graph from its names, its shapes, and the shapes of what it returns."""
 
 from __future__ import annotations
 
@@ -63,15 +63,15 @@ class _Input:
 
 
 @dataclass(frozen=True, slots=True)
-class Guess:
+class GuessedImages:
     """A contract without its outputs, and whether its pixels are known."""
 
     contract: Contract
     pixels_known: bool  # from the user, or from a published family
 
 
-def images_of(model: ModelProto, given: Given, like: str | None) -> Guess:
-    """Guess everything about the inputs of a graph of the family ``like``. Raises ContractError."""
+def images_of(model: ModelProto, given: Given, like: str | None) -> GuessedImages:
+    """GuessedImages everything about the inputs of a graph of the family ``like``. Raises ContractError."""
     inputs = _inputs_of(model)
     published = PUBLISHED.get(like) if like else None
     flows = [each for each in inputs if _FLOW.search(each.name) and not _is_image(each)]
@@ -94,7 +94,7 @@ def images_of(model: ModelProto, given: Given, like: str | None) -> Guess:
     if flows:
         warm = replace(_flow(flows[0], images, published), used=given.warm_start is not False)
         contract = replace(contract, warm_start=warm)
-    return Guess(contract, given.pixels is not None or published is not None)
+    return GuessedImages(contract, given.pixels is not None or published is not None)
 
 
 def family_of(model: ModelProto, file_name: str, given: Given) -> str | None:
@@ -106,7 +106,7 @@ def family_of(model: ModelProto, file_name: str, given: Given) -> str | None:
 
 
 def outputs_of(contract: Contract, network: Network, given: Given) -> Contract:
-    """Guess the output from what the graph returns. Raises ContractError."""
+    """GuessedImages the output from what the graph returns. Raises ContractError."""
     size = texture_size(contract)
     pair = scene(*size, 8, 24, seed=11)
     raw = Trial(contract, network).raw(pair.left, pair.right)
@@ -190,7 +190,7 @@ def _looks_like_flow(each: _Input, inputs: Sequence[_Input]) -> bool:
 
 
 def _images(images: Sequence[_Input], given: Given) -> Contract:
-    """Guess which inputs take the images."""
+    """GuessedImages which inputs take the images."""
     words = ", ".join(each.words for each in images)
     channels = [_channels(each) for each in images]
     by_name = {each.name: each for each in images}
@@ -288,8 +288,8 @@ def _flow(each: _Input, images: Sequence[_Input], published: Published | None) -
 
 def _layout_of(value: NDArray[Any], size: tuple[int, int]) -> tuple[Layout, float] | None:
     """The layout of an output, and its width by that of the images; None: it is no map."""
-    layouts: list[Layout] = {4: ["NCHW", "NHWC"], 3: ["NHW"], 2: ["HW"]}.get(value.ndim, [])  # type: ignore[assignment]
-    for layout in layouts:
+    axes_orders: list[Layout] = {4: ["NCHW", "NHWC"], 3: ["NHW"], 2: ["HW"]}.get(value.ndim, [])  # type: ignore[assignment]
+    for layout in axes_orders:
         height, width = (value.shape[layout.index(axis)] for axis in "HW")
         channels = value.shape[layout.index("C")] if "C" in layout else 1
         for scale in (1.0, 0.5, 0.25, 0.125, 0.0625):
