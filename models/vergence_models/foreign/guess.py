@@ -1,4 +1,4 @@
-"""GuessedImages the contract of a graph from its names, its shapes, and the shapes of what it returns."""
+"""Guess the contract of a graph from its names, its shapes, and the shapes of what it returns."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class GuessedImages:
 
 
 def images_of(model: ModelProto, given: Given, like: str | None) -> GuessedImages:
-    """GuessedImages everything about the inputs of a graph of the family ``like``. Raises ContractError."""
+    """Guess everything about the inputs of a graph of the family ``like``. Raises ContractError."""
     inputs = _inputs_of(model)
     published = PUBLISHED.get(like) if like else None
     flows = [each for each in inputs if _FLOW.search(each.name) and not _is_image(each)]
