@@ -106,7 +106,7 @@ def family_of(model: ModelProto, file_name: str, given: Given) -> str | None:
 
 
 def outputs_of(contract: Contract, network: Network, given: Given) -> Contract:
-    """GuessedImages the output from what the graph returns. Raises ContractError."""
+    """Guess the output from what the graph returns. Raises ContractError."""
     size = texture_size(contract)
     pair = scene(*size, 8, 24, seed=11)
     raw = Trial(contract, network).raw(pair.left, pair.right)
@@ -190,7 +190,7 @@ def _looks_like_flow(each: _Input, inputs: Sequence[_Input]) -> bool:
 
 
 def _images(images: Sequence[_Input], given: Given) -> Contract:
-    """GuessedImages which inputs take the images."""
+    """Guess which inputs take the images."""
     words = ", ".join(each.words for each in images)
     channels = [_channels(each) for each in images]
     by_name = {each.name: each for each in images}
