@@ -5,6 +5,10 @@ from vergence.client import DepthClient
 from vergence.errors import NotOpen, WrongDelivery
 from vergence.filters import keep_confident, keep_range, without_speckles
 from vergence.info import ModelInfo, ServerInfo, StreamInfo
+from vergence.jobs.blocking import BatchClient, BatchJob
+from vergence.jobs.client import AsyncBatchClient, AsyncBatchJob
+from vergence.jobs.frames import BatchFrame
+from vergence.jobs.info import JobInfo
 from vergence.link import LinkState
 from vergence.reprojection import DepthView, View, reproject
 from vergence.results import (
@@ -53,6 +57,7 @@ from vergence_proto.errors import (
     UploadTooLarge,
 )
 from vergence_proto.geometry import Axes, Pose, RectifiedRig
+from vergence_proto.jobs import JobState
 from vergence_proto.types import (
     Delivery,
     DisparityMap,
@@ -70,12 +75,17 @@ from vergence_proto.types import (
 
 __all__ = [
     "DEFAULT_SERVER",
+    "AsyncBatchClient",
+    "AsyncBatchJob",
     "Axes",
     "BadCalibration",
     "BadImage",
     "BadPose",
     "BadSequence",
     "BadShape",
+    "BatchClient",
+    "BatchFrame",
+    "BatchJob",
     "BlockingClient",
     "BlockingSession",
     "ClientTimeout",
@@ -99,6 +109,8 @@ __all__ = [
     "ImageEncoding",
     "InsufficientStorage",
     "Intrinsics",
+    "JobInfo",
+    "JobState",
     "KeyInUse",
     "KeyReused",
     "LinkState",

@@ -7,10 +7,15 @@ class JobState(StrEnum):
     """The state of a job, in the words of the HTTP API."""
 
     QUEUED = "queued"
+    """It waits for its turn, or for what its message says."""
     RUNNING = "running"
+    """Its frames are being stepped."""
     DONE = "done"
+    """All frames were stepped or skipped."""
     FAILED = "failed"
+    """It ended at a frame, and keeps those before."""
     CANCELLED = "cancelled"
+    """It was stopped, and keeps the frames that were done."""
 
     @property
     def ended(self) -> bool:

@@ -34,7 +34,7 @@ import numpy as np
 
 from vergence import DepthClient
 from vergence.cli.demo import bundled_sample
-from vergence.cli.uploads import Upload
+from vergence.jobs.packing import Upload
 from vergence_proto.datasets import SourceFrame, StereoSource, open_source
 from vergence_proto.geometry import RectifiedRig
 from vergence_proto.instruction_set import instruction_set
@@ -164,7 +164,7 @@ async def measure(args: argparse.Namespace) -> dict[str, float]:
     rounds: list[tuple[float, float, float]] = []
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(args.source.partition(":")[2])
-        archive = Upload("source", folder).pack(Path(scratch)).read_bytes()
+        archive = b"".join(Upload(folder).chunks_now())
         async with (
             serving(args.threads, f"{scratch}/jobs") as (grpc, http_address),
             httpx.AsyncClient(base_url=f"http://{http_address}", timeout=120) as http,

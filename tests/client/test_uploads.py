@@ -1,7 +1,7 @@
 """What ``vergence batch`` sends: archives by any name, folders as they are."""
 
-import os
-import zipfile
+import io
+import tarfile
 from pathlib import Path
 
 import pytest
@@ -9,6 +9,7 @@ import pytest
 from tests.support.sequences import make_frames, sequence_files, write_sequence
 from vergence.cli.errors import CliError
 from vergence.cli.uploads import find_uploads
+from vergence.jobs.packing import Upload
 
 
 @pytest.mark.parametrize(
@@ -25,7 +26,7 @@ def test_an_archive_is_one_by_its_suffix_in_any_case(
 ) -> None:
     (tmp_path / name).write_bytes(b"PK")
     (upload,) = find_uploads([tmp_path / name])
-    assert (upload.name, upload.path, upload.source) == (result, tmp_path / name, None)
+    assert (upload.name, upload.upload) == (result, Upload(tmp_path / name))
 
 
 def test_other_files_are_no_uploads(tmp_path: Path) -> None:
@@ -36,14 +37,13 @@ def test_other_files_are_no_uploads(tmp_path: Path) -> None:
 
 def test_a_folder_is_packed_without_companions_and_with_what_links_lead_to(tmp_path: Path) -> None:
     room = write_sequence(tmp_path / "disk" / "room", make_frames(2))
-    for path in room.iterdir():
-        os.utime(path, (0, 0))  # a zip cannot state 1970
     (room / ".DS_Store").write_bytes(b"x")
     (room / "._calib.json").write_bytes(b"x")
     house = tmp_path / "house"
     house.mkdir()
     (house / "room").symlink_to(room, target_is_directory=True)
     (upload,) = find_uploads([house])
-    with zipfile.ZipFile(upload.pack(tmp_path)) as file:
-        names = sorted(name.removeprefix("room/") for name in file.namelist())
+    packed = b"".join(upload.upload.chunks_now())
+    with tarfile.open(fileobj=io.BytesIO(packed)) as file:
+        names = sorted(name.removeprefix("room/") for name in file.getnames())
     assert names == sorted(name for name, _ in sequence_files(make_frames(2)))

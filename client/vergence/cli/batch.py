@@ -2,14 +2,12 @@
 
 import asyncio
 import math
-import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import httpx
 from rich.console import Console
 from rich.progress import Progress, TaskID
 from rich.table import Table
@@ -18,18 +16,18 @@ from vergence.cli.errors import CliError
 from vergence.cli.json_file import write_json
 from vergence.cli.local_server import local_server
 from vergence.cli.progress import progress_bar
-from vergence.cli.result_folder import make_room
-from vergence.cli.sequence_jobs import Job, Query, SequenceService
-from vergence.cli.uploads import Upload, find_uploads
-from vergence.transports.addresses import is_private
-from vergence.transports.credentials import Credentials
-from vergence.transports.http import http_client
-from vergence_proto.errors import DepthError
+from vergence.cli.uploads import NamedUpload, find_uploads
+from vergence.jobs.client import AsyncBatchClient, AsyncBatchJob
+from vergence.jobs.info import JobInfo
+from vergence.jobs.saving import is_finished, make_room
+from vergence.transports.base import ConnectionLost
+from vergence_proto.errors import DepthError, SequenceNotDone
 from vergence_proto.jobs import JobState, ResultFormat
 
-# So many are packed and sent at once; the server runs them one after the other.
+Query = dict[str, str | int | bool | list[str]]
+
+# So many are sent at once; the server runs them one after the other.
 _AT_ONCE = 3
-_CONNECT_S = 10.0
 # A server of one's own takes any image; what an archive holds shows only there.
 _LARGEST_PIXELS = 50_000_000
 
@@ -39,8 +37,9 @@ class Outcome:
     """The end of one upload: its job, and its error if it failed."""
 
     name: str
-    job: Job | None  # None: the server refused the upload
+    job: JobInfo | None  # None: the server refused the upload, or it was done before
     error: str | None = None
+    skipped: bool = False  # its result was there already
 
 
 async def batch(
@@ -58,19 +57,21 @@ async def batch(
     Raises CliError: there is nothing to send, no server, or (at the end) some sequences failed.
     """
     uploads = find_uploads(list(paths))
+    done: list[NamedUpload] = []
+    waiting: list[NamedUpload] = []
+    for upload in uploads:
+        there = await asyncio.to_thread(_is_there, upload, out, form, query)
+        (done if there else waiting).append(upload)
     if form != ResultFormat.MP4:
-        for upload in uploads:
-            make_room(out / upload.name)
-    if server is None:
-        async with local_server(scheme="http", pixels=_LARGEST_PIXELS) as address:
-            outcomes, seconds = await _send(uploads, address, out, form, query, console)
-    else:
-        address = server if "://" in server else f"http://{server}"
-        outcomes, seconds = await _send(uploads, address, out, form, query, console)
+        _make_rooms([out / upload.name for upload in waiting])
+    outcomes, seconds = [Outcome(upload.name, None, skipped=True) for upload in done], 0.0
+    if waiting:
+        sent, seconds = await _send_to(server, waiting, out, form, query, console)
+        outcomes += sent
     console.print(f"results    {out}")
     console.print(_table(outcomes, seconds))
     for each in outcomes:
-        for note in each.job.notes if each.job else ():
+        for note in dict.fromkeys([*each.job.warnings, *each.job.notes] if each.job else ()):
             console.print(f"[yellow]note[/]       {each.name}: {note}", soft_wrap=True)
     if json is not None:
         write_json(json, _figures(outcomes, seconds))
@@ -81,37 +82,62 @@ async def batch(
         raise CliError(f"{unread} frames have no map; the results of all others are written")
 
 
+def _is_there(upload: NamedUpload, out: Path, form: str, query: Query) -> bool:
+    """Return whether a result of these bytes and options has been written before."""
+    folder = out / upload.name
+    return form != ResultFormat.MP4 and is_finished(folder, form, query, upload.upload.digest)
+
+
+def _make_rooms(folders: Sequence[Path]) -> None:
+    for folder in folders:
+        try:
+            make_room(folder)
+        except OSError as error:
+            raise CliError(f"{error}; or choose another one with --out", exit_code=2) from None
+
+
+async def _send_to(
+    server: str | None,
+    uploads: Sequence[NamedUpload],
+    out: Path,
+    form: str,
+    query: Query,
+    console: Console,
+) -> tuple[list[Outcome], float]:
+    if server is not None:
+        return await _send(uploads, server, out, form, query, console)
+    async with local_server(scheme="http", pixels=_LARGEST_PIXELS) as address:
+        return await _send(uploads, address, out, form, query, console)
+
+
 async def _send(
-    uploads: Sequence[Upload],
-    address: str,
+    uploads: Sequence[NamedUpload],
+    server: str,
     out: Path,
     form: str,
     query: Query,
     console: Console,
 ) -> tuple[list[Outcome], float]:
     started_s = time.monotonic()
-    # Only connecting is bounded: the length of an upload is not known.
-    timeout = httpx.Timeout(None, connect=_CONNECT_S)
-    shown = Credentials.of(None, None, None, None, private=is_private(address))
-    with progress_bar(console) as progress, tempfile.TemporaryDirectory() as scratch:
-        async with http_client(
-            address, timeout=timeout, headers=dict(shown.headers), verify=shown.tls()
-        ) as http:
-            service = SequenceService(http)
+    with progress_bar(console) as progress:
+        async with AsyncBatchClient(server) as client:
             places = asyncio.Semaphore(_AT_ONCE)
 
-            async def one(upload: Upload) -> Outcome:
+            async def one(upload: NamedUpload) -> Outcome:
                 async with places:
                     bar = progress.add_task(upload.name, total=None, note="uploading")
+                    job: AsyncBatchJob | None = None
                     try:
-                        job = await _run(service, upload, Path(scratch), query, progress, bar)
-                        if job.state is JobState.FAILED:
-                            return Outcome(upload.name, job, f"{job.reason}: {job.message}")
-                        await service.fetch(job, form, out / upload.name)
-                        await service.forget(job)
-                        return Outcome(upload.name, job)
+                        job = await client.send(upload.upload, query)
+                        await _fetch(job, form, out / upload.name, progress, bar)
+                        await job.delete()
+                        return Outcome(upload.name, job.info)
                     except DepthError as error:
-                        return Outcome(upload.name, None, f"{error.code}: {error}")
+                        info = job.info if job else None
+                        return Outcome(upload.name, info, f"{error.code}: {error}")
+                    except (ConnectionLost, OSError) as error:
+                        known = f"; its job is {job.id}" if job else ""
+                        return Outcome(upload.name, None, f"{error}{known}")
                     finally:
                         progress.remove_task(bar)
 
@@ -119,25 +145,28 @@ async def _send(
     return outcomes, time.monotonic() - started_s
 
 
-async def _run(
-    service: SequenceService,
-    upload: Upload,
-    scratch: Path,
-    query: Query,
-    progress: Progress,
-    bar: TaskID,
-) -> Job:
-    """Upload and wait until the job has ended."""
-    source: Query = {} if upload.source is None else {"source": upload.source}
-    archive = await asyncio.to_thread(upload.pack, scratch)
-    job = await service.submit(archive, {**query, **source})
-    if archive != upload.path:
-        archive.unlink()
-    async for job in service.watch(job):  # noqa: B020  the last one is returned
-        ahead = f"{job.ahead} before it" if job.ahead else job.state
-        note = f"{job.fps:.1f} fps" if job.fps else ahead
-        progress.update(bar, completed=job.frames_done, total=job.frames, note=note)
-    return job
+async def _fetch(
+    job: AsyncBatchJob, form: str, target: Path, progress: Progress, bar: TaskID
+) -> None:
+    """Wait until the job has ended, and write its result meanwhile."""
+
+    async def show() -> None:
+        async for info in job.watch():
+            ahead = f"{info.ahead} before it" if info.ahead else info.state
+            note = f"{info.fps:.1f} fps" if info.fps else ahead
+            progress.update(bar, completed=info.frames_done, total=info.frames, note=note)
+
+    showing = asyncio.create_task(show())
+    try:
+        if form == ResultFormat.MP4:
+            await job.download(target.with_name(f"{target.name}.mp4"), form)
+        else:
+            await job.save_as(target, form)
+    finally:
+        showing.cancel()
+        await asyncio.gather(showing, return_exceptions=True)
+    if job.info.state is JobState.CANCELLED:
+        raise SequenceNotDone("the job was cancelled; the frames before that are written")
 
 
 def _frames(outcomes: Sequence[Outcome]) -> int:
@@ -151,7 +180,8 @@ def _figures(outcomes: Sequence[Outcome], seconds: float) -> Mapping[str, Any]:
         "failed": sum(each.error is not None for each in outcomes),
         "frames": frames,
         "seconds": seconds,
-        "fps": frames / seconds,
+        "fps": frames / seconds if seconds else None,
+        "skipped": sum(each.skipped for each in outcomes),
         "results": {
             each.name: {
                 "frames": each.job.frames if each.job else 0,
@@ -170,9 +200,9 @@ def _table(outcomes: Sequence[Outcome], seconds: float) -> Table:
     table = Table("sequence", title=title, title_justify="left")
     for name in ("frames", "fps", "EPE px", "D1 %"):
         table.add_column(name, justify="right")
-    failed = any(each.error for each in outcomes)
+    failed = any(each.error or each.skipped for each in outcomes)
     if failed:
-        table.add_column("error")
+        table.add_column("")
     for each in outcomes:
         job = each.job
         accuracy = (job.accuracy if job else None) or {}
@@ -181,6 +211,6 @@ def _table(outcomes: Sequence[Outcome], seconds: float) -> Table:
             each.name,
             str(job.frames) if job else "",
             *(f"{value:.2f}" if value and math.isfinite(value) else "" for value in numbers),
-            *([each.error or ""] if failed else []),
+            *([each.error or ("was there" if each.skipped else "")] if failed else []),
         )
     return table

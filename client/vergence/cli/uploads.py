@@ -1,65 +1,48 @@
-"""Uploads of ``vergence batch``: archives as they are, folders packed into archives."""
+"""What ``vergence batch`` sends: archives, folders of one sequence, or folders of many."""
 
-import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from vergence.cli.errors import CliError
+from vergence.jobs.packing import ARCHIVES, Upload
 from vergence_proto.datasets import DATASETS, DatasetError, find_sources
-from vergence_proto.datasets.listing import found
 
-_ARCHIVES = (".zip", ".tar", ".tar.gz", ".tgz", ".tar.xz", ".txz", ".tar.bz2", ".tbz2")
 _OWN_LAYOUT = "vergence"
 
 
 @dataclass(frozen=True, slots=True)
-class Upload:
-    """One sequence and its location."""
+class NamedUpload:
+    """One sequence and the name of its result, unique in a batch."""
 
-    name: str  # the name of the results, unique in a batch
-    path: Path  # an archive, or a folder to pack
-    source: str | None = None  # KIND:PATH inside the archive; None: the server finds it
-
-    def pack(self, scratch: Path) -> Path:
-        """Return the archive to send; it stores files, since images are compressed already."""
-        if self.path.is_file():
-            return self.path
-        archive = scratch / f"{self.name}.zip"
-        # A file system may state a time before 1980, which the format cannot.
-        with zipfile.ZipFile(archive, "w", strict_timestamps=False) as file:
-            for each in found(self.path, "*"):
-                if each.is_file():
-                    file.write(each, each.relative_to(self.path))
-        return archive
+    name: str
+    upload: Upload
 
 
-def find_uploads(paths: list[Path]) -> list[Upload]:
+def find_uploads(paths: list[Path]) -> list[NamedUpload]:
     """Find the sequences at ``paths``: archives, folders of one, or of many in Vergence's layout.
 
     Raises CliError: a path is neither, or contains no sequence.
     """
     taken: set[str] = set()
     return [
-        Upload(_unique(upload.name, taken), upload.path, upload.source)
-        for path in paths
-        for upload in _at(path)
+        NamedUpload(_unique(each.name, taken), each.upload) for path in paths for each in _at(path)
     ]
 
 
-def _at(path: Path) -> Iterator[Upload]:
-    suffix = next((each for each in _ARCHIVES if path.name.lower().endswith(each)), None)
+def _at(path: Path) -> Iterator[NamedUpload]:
+    suffix = next((each for each in ARCHIVES if path.name.lower().endswith(each)), None)
     if path.is_file() and suffix is not None:
-        yield Upload(path.name[: -len(suffix)] or path.name, path)
+        yield NamedUpload(path.name[: -len(suffix)] or path.name, Upload(path))
         return
     if not path.is_dir():
         raise CliError(
-            f"{path}: expected a folder, or an archive ({' '.join(_ARCHIVES)})", exit_code=2
+            f"{path}: expected a folder, or an archive ({' '.join(ARCHIVES)})", exit_code=2
         )
     own = _found(_OWN_LAYOUT, path)
     if own:
         for folder in own:
-            yield Upload(folder.name or path.resolve().name, folder)
+            yield NamedUpload(folder.name or path.resolve().name, Upload(folder))
         return
     others = [(kind, each) for kind in DATASETS for each in _found(kind, path)]
     if not others:
@@ -70,7 +53,8 @@ def _at(path: Path) -> Iterator[Upload]:
             f"{path}: more than one sequence ({named}); name folders that hold one", exit_code=2
         )
     kind, folder = others[0]
-    yield Upload(folder.name or path.resolve().name, path, f"{kind}:{folder.relative_to(path)}")
+    source = f"{kind}:{folder.relative_to(path)}"
+    yield NamedUpload(folder.name or path.resolve().name, Upload(path, source))
 
 
 def _found(kind: str, path: Path) -> list[Path]:

@@ -1,0 +1,392 @@
+"""The client of a server's jobs, for asyncio."""
+
+import asyncio
+import secrets
+import time
+from collections.abc import AsyncGenerator, AsyncIterator, Iterable, Mapping, Sequence
+from contextlib import ExitStack, aclosing
+from pathlib import Path
+from typing import Any, Literal, Self
+
+from vergence.errors import NotOpen
+from vergence.jobs.frames import BatchFrame
+from vergence.jobs.info import JobInfo
+from vergence.jobs.packing import Upload, upload_of
+from vergence.jobs.requests import Query, Requests
+from vergence.jobs.saving import Saving, checked_format, make_room
+from vergence.transports.addresses import is_private
+from vergence.transports.credentials import Credentials
+from vergence_proto.errors import DepthError, SequenceNotDone, error_from_wire
+from vergence_proto.geometry import RectifiedRig
+from vergence_proto.job_results.frame_file import JobFrame, decode_frame, decode_record
+from vergence_proto.jobs import JobState
+from vergence_proto.ordered import in_order
+
+DEFAULT_SERVER = "http://127.0.0.1:8000"
+_SEQUENCES = "/v1/sequences"
+_WAIT_S = 15.0  # of one request for the next frames
+_LINES = 64
+_AHEAD = 3  # frames that are fetched while one is used
+_WATCH_EVERY_S = 0.5
+
+Source = str | Path | Iterable[tuple[Any, ...]]
+Output = Literal["disparity", "depth", "confidence", "sigma", "left", "points"]
+Format = Literal[
+    "png16", "png16mm", "pfm", "npz", "nerfstudio", "colmap", "tum", "kitti", "middlebury", "eth3d"
+]
+
+
+class AsyncBatchClient:
+    """Submits whole sequences to a server, and reads their results; use it inside ``async with``.
+
+    Every method goes on after lost connections and restarts of the server.
+
+    Parameters
+    ----------
+    server
+        ``http://HOST:PORT`` or ``https://HOST:PORT``.
+    token, ca, cert, key
+        Credentials, as those of :class:`DepthClient`.
+    patience_s
+        Give up when no byte has come or gone for this long.
+
+    Raises
+    ------
+    ValueError
+        A credential cannot be used.
+    ImportError
+        httpx is not installed; it is part of ``vergence[cli]``.
+    """
+
+    def __init__(
+        self,
+        server: str = DEFAULT_SERVER,
+        *,
+        token: str | None = None,
+        ca: str | Path | None = None,
+        cert: str | Path | None = None,
+        key: str | Path | None = None,
+        patience_s: float = 60.0,
+    ) -> None:
+        address = server if "://" in server else f"http://{server}"
+        private = is_private(address)
+        self._address = address
+        self._credentials = Credentials.of(token, ca, cert, key, private=private)
+        self._patience_s = patience_s
+        self._open: Requests | None = None
+
+    async def __aenter__(self) -> Self:
+        """Open the client."""
+        self._open = Requests(self._address, self._credentials, patience_s=self._patience_s)
+        await self._open.__aenter__()
+        return self
+
+    async def __aexit__(self, *exc_info: object) -> None:
+        """Close the client; its jobs go on."""
+        requests, self._open = self._open, None
+        if requests is not None:
+            await requests.__aexit__(*exc_info)
+
+    async def submit(
+        self,
+        source: Source,
+        *,
+        outputs: Sequence[Output] = ("disparity",),
+        name: str = "",
+        labels: Mapping[str, str] | None = None,
+        on_error: Literal["skip", "fail"] = "skip",
+        iterations: int = 0,
+        metrics: bool = False,
+        rig: RectifiedRig | None = None,
+        fps: float = 30.0,
+    ) -> "AsyncBatchJob":
+        """Upload a sequence; return its job when the server has accepted it.
+
+        It waits while the server has no room. A lost connection does not submit it twice.
+
+        Parameters
+        ----------
+        source
+            A folder, an archive, ``KIND:PATH`` of a data set, or pairs of arrays: ``(left, right)``
+            or ``(left, right, world_from_left)``, uint8 [H, W] or [H, W, 3] RGB.
+        outputs
+            What to keep of every frame.
+        name, labels
+            Your own name and labels for the job.
+        on_error
+            "skip": a frame that cannot be read or stepped only costs itself; "fail": it ends the
+            job, which keeps the frames before.
+        iterations
+            Refinement iterations of every step; 0: the server's default, which is best.
+        metrics
+            Compare with the ground truth of the sequence.
+        rig, fps
+            The rectified rig and the frame rate of arrays.
+
+        Raises
+        ------
+        BadSequence, BadCalibration, BadShape, FrameTooLarge, UploadTooLarge
+            The server cannot use the sequence, or the source is none.
+        InsufficientStorage
+            The disk of the server has no room.
+        ConnectionLost
+            The server cannot be reached.
+        """
+        query = {
+            "output": list(outputs),
+            "name": name,
+            "label": [f"{key}:{value}" for key, value in (labels or {}).items()],
+            "on_error": on_error,
+            "iterations": iterations,
+            "metrics": metrics,
+        }
+        with ExitStack() as stack:
+            upload = await asyncio.to_thread(_upload_of, source, stack, rig, fps)
+            return await self.send(upload, query)
+
+    async def send(self, upload: Upload, query: Query) -> "AsyncBatchJob":
+        """Upload what was found before, with the options of the HTTP API."""
+        size = await asyncio.to_thread(upload.size)
+        headers = {
+            "Content-Type": "application/octet-stream",
+            "Content-Length": str(size),
+            "Idempotency-Key": f'"{secrets.token_hex(16)}"',
+        }
+        source = {} if upload.source is None else {"source": upload.source}
+        answer = await self._requests.ask(
+            "POST",
+            _SEQUENCES,
+            query={**query, **source},
+            headers=headers,
+            body=upload.chunks,
+            when_full=True,
+        )
+        return AsyncBatchJob(self._requests, JobInfo.from_json(answer.json()))
+
+    async def job(self, job_id: str) -> "AsyncBatchJob":
+        """Return a job that was submitted before, here or elsewhere. Raises UnknownSequence."""
+        answer = await self._requests.ask("GET", f"{_SEQUENCES}/{job_id}")
+        return AsyncBatchJob(self._requests, JobInfo.from_json(answer.json()))
+
+    async def jobs(
+        self, *, state: JobState | None = None, labels: Mapping[str, str] | None = None
+    ) -> AsyncIterator[JobInfo]:
+        """Yield your jobs, newest first. Servers without tokens list none."""
+        filters = [f"{key}:{value}" for key, value in (labels or {}).items()]
+        query: dict[str, Any] = {"label": filters, **({"state": state} if state else {})}
+        url: str | None = _SEQUENCES
+        while url is not None:
+            answer = await self._requests.ask("GET", url, query=query)
+            for values in answer.json():
+                yield JobInfo.from_json(values)
+            url, query = answer.links.get("next", {}).get("url"), {}
+
+    @property
+    def _requests(self) -> Requests:
+        if self._open is None:
+            raise NotOpen("the client is not open; write: async with AsyncBatchClient() as client")
+        return self._open
+
+
+class AsyncBatchJob:
+    """A job on a server; :meth:`AsyncBatchClient.submit` or :meth:`AsyncBatchClient.job` makes it.
+
+    Every method raises UnknownSequence if the job was deleted or has expired, and ConnectionLost if
+    the server cannot be reached.
+    """
+
+    def __init__(self, requests: Requests, info: JobInfo) -> None:
+        self._requests = requests
+        self._path = f"{_SEQUENCES}/{info.id}"
+        self._rig: RectifiedRig | None = None
+        self.info: JobInfo = info
+        """The job as the server last stated it; :meth:`refresh` asks again."""
+
+    @property
+    def id(self) -> str:
+        """The id of the job, for :meth:`AsyncBatchClient.job`."""
+        return self.info.id
+
+    async def refresh(self) -> JobInfo:
+        """Ask the server for the state of the job."""
+        answer = await self._requests.ask("GET", self._path)
+        self.info = JobInfo.from_json(answer.json())
+        return self.info
+
+    async def watch(self) -> AsyncIterator[JobInfo]:
+        """Yield the state of the job twice a second, until it has ended."""
+        while True:
+            yield self.info
+            if self.info.state.ended:
+                return
+            await asyncio.sleep(_WATCH_EVERY_S)
+            await self.refresh()
+
+    async def wait(self) -> JobInfo:
+        """Wait for the end of the job. Raises the error of a failed job."""
+        async for _ in self.watch():
+            pass
+        self._check()
+        return self.info
+
+    async def cancel(self) -> JobInfo:
+        """Stop the job; the frames that are done stay."""
+        answer = await self._requests.ask("POST", f"{self._path}/cancel")
+        self.info = JobInfo.from_json(answer.json())
+        return self.info
+
+    async def delete(self) -> None:
+        """Delete the job and its files on the server."""
+        await self._requests.ask("DELETE", self._path)
+
+    async def manifest(self) -> Mapping[str, Any]:
+        """Return what is known about the job: model, options, rig, units, counts.
+
+        Raises SequenceNotDone: no frame is done.
+        """
+        manifest: Mapping[str, Any] = (
+            await self._requests.ask("GET", f"{self._path}/manifest")
+        ).json()
+        return manifest
+
+    async def frames(self, *, after: int = -1) -> AsyncIterator[BatchFrame]:
+        """Yield the frames in order, each when it is made, those without a map included.
+
+        The iteration goes on through lost connections and restarts of the server, and ends with the
+        job. ``after``: begin behind the frame of this index.
+
+        Raises the error of a failed job, after its last frame.
+        """
+        async with aclosing(self._raw_frames(after)) as frames:
+            async for frame in frames:
+                yield BatchFrame.of(frame)
+        self._check()
+
+    async def next_frames(self, after: int, *, most: int) -> tuple[list[BatchFrame], bool]:
+        """Return up to ``most`` frames behind ``after``, and whether no other will follow."""
+        indices, ended = await self._ready(after, most)
+        frames = [BatchFrame.of(await self._frame(index)) for index in indices]
+        if ended and not frames:
+            await self.refresh()
+            self._check()
+        return frames, ended
+
+    async def save(
+        self, folder: str | Path, format: Format = "png16", *, progress: Any = None
+    ) -> Path:
+        """Write the result to a folder, each frame when it is made; return the folder.
+
+        A failed job leaves the frames before its failure, and then its error is raised.
+
+        Parameters
+        ----------
+        folder
+            A new or empty folder, or one with the result of another job, which is replaced.
+        format
+            The layout of the files.
+        progress
+            Called with each frame that was written.
+
+        Raises
+        ------
+        FileExistsError
+            The folder holds files that are no results.
+        BadShape
+            The job has not kept what the layout needs, for example the left images.
+        """
+        return await self.save_as(Path(folder), format, progress=progress)
+
+    async def save_as(self, target: Path, form: str, *, progress: Any = None) -> Path:
+        """Write the result as :meth:`save` does, in a format that is named by text."""
+        checked_format(form)
+        await asyncio.to_thread(make_room, target)
+        saving: Saving | None = None
+        async with aclosing(self._raw_frames(-1)) as frames:
+            async for frame in frames:
+                if saving is None:
+                    saving = Saving(target, form, await self.manifest())
+                await asyncio.to_thread(saving.write, frame)
+                if progress is not None:
+                    progress(BatchFrame.of(frame))
+        if saving is not None:
+            await asyncio.to_thread(saving.end, await self.manifest())
+        self._check()
+        return target
+
+    async def download(self, path: str | Path, format: str = "mp4") -> Path:
+        """Write the result as one file: a film, or an archive in any layout; return its path."""
+        target = Path(path)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        await self.wait()
+
+        async def fetch() -> None:
+            answers = self._requests.stream(
+                f"{self._path}/result", query={"format": format}, headers={}
+            )
+            async for answer in answers:
+                if answer.is_error:
+                    await answer.aread()
+                    problem = answer.json()
+                    raise error_from_wire(problem["reason"], problem["detail"])
+                with await asyncio.to_thread(target.open, "wb") as file:
+                    async for chunk in answer.aiter_bytes():
+                        self._requests.moved()
+                        await asyncio.to_thread(file.write, chunk)
+
+        await self._requests.patiently(fetch)
+        return target
+
+    async def _raw_frames(self, after: int) -> AsyncGenerator[JobFrame, None]:
+        async with (
+            aclosing(self._indices(after)) as indices,
+            aclosing(in_order(indices, self._frame, limit=_AHEAD)) as frames,
+        ):
+            async for frame in frames:
+                yield frame
+        await self.refresh()
+
+    async def _indices(self, after: int) -> AsyncGenerator[int, None]:
+        ended = False
+        while not ended:
+            ready, ended = await self._ready(after, _LINES)
+            for index in ready:
+                yield index
+                after = index
+
+    async def _ready(self, after: int, most: int) -> tuple[list[int], bool]:
+        """Wait for frames behind ``after``; return their indices, and whether none will follow."""
+        query = {"after": after, "limit": most, "wait_s": _WAIT_S}
+        while True:
+            asked_s = time.monotonic()
+            answer = await self._requests.ask("GET", f"{self._path}/frames", query=query)
+            lines = answer.content.splitlines()
+            ended = answer.headers.get("Vergence-Ended") == "true"
+            if lines or ended:
+                count = len(lines)
+                return [*range(after + 1, after + 1 + count)], ended
+            if time.monotonic() - asked_s < _WATCH_EVERY_S:  # the server is stopping
+                await asyncio.sleep(_WATCH_EVERY_S)
+
+    async def _frame(self, index: int) -> JobFrame:
+        while True:
+            try:
+                answer = await self._requests.ask("GET", f"{self._path}/frames/{index}")
+                break
+            except SequenceNotDone:  # a server that restarted steps it again
+                await asyncio.sleep(_WATCH_EVERY_S)
+        data = answer.content
+        if self._rig is None and decode_record(data).error is None:
+            rig = (await self.manifest())["rig"]
+            self._rig = None if rig is None else RectifiedRig(**rig)
+        return await asyncio.to_thread(decode_frame, data, self._rig)
+
+    def _check(self) -> None:
+        if self.info.state is JobState.FAILED:
+            raise self._failure()
+
+    def _failure(self) -> DepthError:
+        return error_from_wire(str(self.info.reason), str(self.info.message))
+
+
+def _upload_of(source: Any, stack: ExitStack, rig: RectifiedRig | None, fps: float) -> Upload:
+    return upload_of(source, stack, rig=rig, fps=fps)
