@@ -21,6 +21,7 @@ from zenoh.handlers import Callback
 
 from vergence_proto import codec
 from vergence_proto.errors import DepthError, ModelFailed
+from vergence_proto.zenoh.json5_keys import keys_of
 from vergence_proto.zenoh.keys import encoding_of, server_of
 
 Value = TypeVar("Value")
@@ -64,14 +65,15 @@ class QueryReply:
 def make_config(
     file: Path | None = None, /, *, max_message_bytes: int, **settings: Any
 ) -> zenoh.Config:
-    """Read the configuration from a Zenoh JSON5 file, or start from the project's defaults.
+    """Make a configuration: the project's defaults, what a Zenoh JSON5 file sets, ``settings``.
 
     ``settings`` override single values; their names are Zenoh's keys with ``__`` for the slash.
     Raises zenoh.ZError: the file is no Zenoh configuration.
     """
     config = zenoh.Config.from_file(file) if file else zenoh.Config()
+    in_file = set(keys_of(file.read_text("utf-8"))) if file else set()
     values = {
-        **({} if file else _DEFAULTS),
+        **{key: value for key, value in _DEFAULTS.items() if not _has(in_file, key)},
         # With the default, one message may use a gigabyte of memory.
         "transport/link/rx/max_message_size": max_message_bytes,
         **{key.replace("__", "/"): value for key, value in settings.items()},
@@ -79,6 +81,11 @@ def make_config(
     for key, value in values.items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+def _has(keys: set[str], key: str) -> bool:
+    """Return whether a key, or a part of it, is among ``keys``."""
+    return any(each == key or each.startswith(f"{key}/") for each in keys)
 
 
 def user_of(config: zenoh.Config) -> str:
