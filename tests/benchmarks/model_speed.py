@@ -22,10 +22,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vergence_models.evaluation.sgbm import sgbm_disparity
 from vergence_native import variants
 from vergence_proto.geometry import Pose, RectifiedRig
 from vergence_proto.instruction_set import instruction_set
+from vergence_proto.sgbm import sgbm_disparity
 from vergence_service.inference.model import Step, StereoView
 from vergence_service.inference.native_model import NativeStereoModel
 from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir

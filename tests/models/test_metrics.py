@@ -13,10 +13,10 @@ from vergence_models.data.pool import write_shard
 from vergence_models.evaluate import main
 from vergence_models.evaluation.metric_accumulator import settled_frame
 from vergence_models.evaluation.metrics import calibration, error_measures, temporal_error
-from vergence_models.evaluation.sgbm import filled, sgbm_disparity
 from vergence_models.evaluation.stepping import footage_from_clip
 from vergence_models.export import shifted_pair
 from vergence_proto.geometry import Pose
+from vergence_proto.sgbm import filled, sgbm_disparity
 
 
 def test_measures_of_known_errors() -> None:

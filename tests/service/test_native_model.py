@@ -12,7 +12,7 @@ import vergence_native
 from tests.service.test_onnx_model import make_view
 from tests.support.weights_copy import WEIGHTS
 from vergence_native import library
-from vergence_service.inference.engines import load_model
+from vergence_service.inference.engines import ServedModel, load_model
 from vergence_service.inference.model import RecurrentState, Step, StepResult, StereoModel
 from vergence_service.inference.native_model import NativeStereoModel
 from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
@@ -129,7 +129,7 @@ def test_the_memory_of_a_step_is_at_most_what_the_model_says(native: NativeStere
 
 def load(
     name: str = "lite", *, engine: str = "auto", weights: Path | None = None, provider: str = "cpu"
-) -> closing[OnnxStereoModel | NativeStereoModel]:
+) -> closing[ServedModel]:
     return closing(
         load_model(
             weights or packaged_weights_dir(),

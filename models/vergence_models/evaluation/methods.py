@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vergence_models.data.trajectories import rotation
-from vergence_models.evaluation.sgbm import sgbm_disparity
 from vergence_models.evaluation.stepping import Footage, Prediction, SteppedNetwork
 from vergence_proto.geometry import Pose
+from vergence_proto.sgbm import sgbm_disparity
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,10 +23,9 @@ from vergence_service.app.security import (
 from vergence_service.app.zenoh import ZenohTransport, serving_zenoh
 from vergence_service.descriptors import affordable_connections
 from vergence_service.inference.batcher import StepBatcher
-from vergence_service.inference.engines import load_model
+from vergence_service.inference.engines import ServedModel, load_model
 from vergence_service.inference.model import StereoModel
-from vergence_service.inference.native_model import NativeStereoModel
-from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
+from vergence_service.inference.onnx_model import packaged_weights_dir
 from vergence_service.jobs.queue import JobQueue
 from vergence_service.memory import MemoryBudget, affordable_bytes
 from vergence_service.metrics import Metrics
@@ -63,7 +62,7 @@ class Running:
     loading: asyncio.Task[None]  # of the graphs that live streams do not need
 
 
-def make_model(settings: Settings) -> OnnxStereoModel | NativeStereoModel:
+def make_model(settings: Settings) -> ServedModel:
     """Load the model card of the settings.
 
     Raises ManifestError if the manifest cannot be used, ProviderUnavailable if the engine or an

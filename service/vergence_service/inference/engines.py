@@ -7,8 +7,11 @@ from pathlib import Path
 from vergence_service.inference.native_model import NativeStereoModel
 from vergence_service.inference.onnx_model import OnnxStereoModel
 from vergence_service.inference.providers import ProviderUnavailable
+from vergence_service.inference.sgbm_model import SGBM_MODELS, SgbmModel
 
 log = logging.getLogger(__name__)
+
+ServedModel = OnnxStereoModel | NativeStereoModel | SgbmModel
 
 NATIVE_MODEL = "lite"  # the model that the native engine has kernels for
 
@@ -21,14 +24,21 @@ def load_model(
     providers: Sequence[str],
     threads: int,
     allow_spinning: bool,
-) -> OnnxStereoModel | NativeStereoModel:
+) -> ServedModel:
     """Load a model into ``engine``: "auto", "native" or "onnxruntime".
 
-    "auto" is native for `lite` on a CPU, if the library is there and knows the weights.
+    "auto" is native for `lite` on a CPU, if the library is there and knows the weights. `sgbm` and
+    `sgbm-half` have no weights: OpenCV computes them, if the engine is "auto".
 
     Raises ManifestError if the manifest cannot be used, and ProviderUnavailable if the engine or
     its execution provider cannot be used.
     """
+    if name in SGBM_MODELS:
+        if engine != "auto":
+            raise ProviderUnavailable(
+                f"OpenCV computes {name}; set model.engine to auto, not {engine!r}"
+            )
+        return SgbmModel(name, threads=threads)
     if engine == "native" and providers[0] != "cpu":
         raise ProviderUnavailable(
             f"the native engine runs on the CPU; set model.providers to cpu, not {providers[0]!r}, "

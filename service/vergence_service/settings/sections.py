@@ -93,7 +93,9 @@ class AdminSettings(Section):
 
 
 class ModelSettings(Section):
-    name: str = Field(default="lite", description="model of the manifest")
+    name: str = Field(
+        default="lite", description="model of the manifest, or sgbm or sgbm-half of OpenCV"
+    )
     weights: Path | None = Field(
         default=None,
         description="folder with a manifest.json; default: the installed weights, or what "

@@ -1,4 +1,7 @@
-"""The classical baseline: OpenCV's StereoSGBM, three-way, with holes filled from the sides."""
+"""The classical baseline of studies and of the server: OpenCV's StereoSGBM, three-way.
+
+Its holes are filled from the sides.
+"""
 
 from __future__ import annotations
 
@@ -9,19 +12,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 Plane = NDArray[np.float32]
+Image = NDArray[np.uint8]
 
 
 def sgbm_disparity(
-    left: NDArray[np.uint8],
-    right: NDArray[np.uint8],
-    *,
-    max_disparity_px: int = 128,
-    scale: float = 1.0,
+    left: Image, right: Image, *, max_disparity_px: int = 128, scale: float = 1.0
 ) -> Plane:
-    """Dense disparity in px of the full image, [H, W]. ``scale`` 0.5 matches at half size.
+    """Dense disparity in px of the full image, [H, W]; see :func:`sgbm_matches`."""
+    dense, _ = sgbm_matches(left, right, max_disparity_px=max_disparity_px, scale=scale)
+    return dense
 
-    The left border is padded, so that it is searched too; a hole takes the smaller (farther) of
-    its two neighbours in the row, as an occlusion would.
+
+def sgbm_matches(
+    left: Image, right: Image, *, max_disparity_px: int, scale: float
+) -> tuple[Plane, NDArray[np.bool_]]:
+    """Dense disparity in px of the full image, and where it was matched, [H, W] each.
+
+    ``left`` and ``right`` are RGB, [H, W, 3]. ``scale`` 0.5 matches at half size. The left border
+    is padded, so that it is searched too; a hole takes the smaller (farther) of its two neighbours
+    in the row, as an occlusion would.
     """
     height, width = left.shape[:2]
     eyes = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right)]
@@ -45,11 +54,14 @@ def sgbm_disparity(
     )
     grown = [cv2.copyMakeBorder(eye, 0, 0, search, 0, cv2.BORDER_REPLICATE) for eye in eyes]
     found = np.asarray(matcher.compute(*grown), np.float32)[:, search:] / np.float32(16)
-    dense = filled(found)
+    dense, matched = filled(found), found > 0
     if scale == 1:
-        return dense
+        return dense, matched
     full = cv2.resize(dense, (width, height), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(full, np.float32) / np.float32(scale)
+    seen = cv2.resize(
+        matched.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST
+    ).astype(np.bool_)
+    return np.asarray(full, np.float32) / np.float32(scale), seen
 
 
 def filled(disparity: Plane) -> Plane:
