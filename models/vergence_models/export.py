@@ -2,6 +2,9 @@
 
 The graphs hold the same weights, those of large networks in one file beside them. Each is checked
 against PyTorch over a short sequence before it is written down in the manifest.
+
+``--sigma`` writes only what ``train_sigma`` trained into the graphs that are there already: their
+disparity keeps its bits.
 """
 
 from __future__ import annotations
@@ -32,6 +35,7 @@ from vergence_models.networks.lite.network import LiteNetwork
 from vergence_models.networks.raft.network import RaftNetwork
 from vergence_models.onnx_export.calibrate import make_int8
 from vergence_models.onnx_export.lite_parts import parts_of as lite_parts_of
+from vergence_models.onnx_export.lite_parts import sigma_part
 from vergence_models.onnx_export.modules import GraphPart, export_part, folded
 from vergence_models.onnx_export.raft_parts import parts_of as raft_parts_of
 from vergence_models.onnx_export.stages import handed_on, in_stages
@@ -39,11 +43,17 @@ from vergence_models.onnx_export.stitch import (
     RefinementAt2x,
     StepParts,
     stitched,
+    with_sigma,
     write_with_shared_weights,
 )
 from vergence_models.progress import no_progress, progress_bar, silent
 from vergence_models.training.runs import Run, RunError, read_run, trained_network
-from vergence_proto.model_io import MANIFEST_FORMAT, MANIFEST_NAME
+from vergence_proto.model_io import (
+    MANIFEST_FORMAT,
+    MANIFEST_NAME,
+    ManifestError,
+    load_model_card,
+)
 
 log = logging.getLogger("vergence_models.export")
 
@@ -158,6 +168,27 @@ def export_run(
     write_model(out, config.name, models, parts, entry)
 
 
+def export_sigma(run: Run, config: Config, out: Path) -> None:
+    """Put a run's part for sigma into the graphs in ``out``, and its story into their manifest.
+
+    Raises ManifestError if ``out`` has no graphs of this network, and RunError.
+    """
+    network = folded(trained_network(run))
+    if not isinstance(network, LiteNetwork):
+        raise ConfigError(f"{config.name}: only lite has a part for sigma of its own")
+    card = load_model_card(out, config.name)
+    part = exported_part(sigma_part(network))
+    manifest = json.loads((out / MANIFEST_NAME).read_text("utf-8"))
+    entry = manifest["models"][config.name]
+    steps = (*card.graphs.values(), *card.cold_graphs.values())
+    for path in {stages[-1][0] for stages in steps}:
+        onnx.save(with_sigma(onnx.load(path), part), path)
+        entry["files"][path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
+    entry["parameters"] = sum(p.numel() for p in network.parameters())
+    entry |= {"training": run.story, "measured": run.measured}
+    write_entry(out / MANIFEST_NAME, config.name, entry)
+
+
 def write_model(
     out: Path,
     name: str,
@@ -210,10 +241,7 @@ def exported_parts(
 
     def exported(part: GraphPart) -> ModelProto:
         on_step(f"tracing {type(part.module).__name__}")
-        with TemporaryDirectory() as folder:
-            path = Path(folder) / "part.onnx"
-            export_part(part, path)
-            return onnx.load(path)
+        return exported_part(part)
 
     look = parts.at_2x
     return StepParts(
@@ -223,7 +251,15 @@ def exported_parts(
         None
         if look is None
         else RefinementAt2x(exported(look.enter), look.moved, exported(look.join)),
+        None if parts.sigma is None else exported(parts.sigma),
     )
+
+
+def exported_part(part: GraphPart) -> ModelProto:
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "part.onnx"
+        export_part(part, path)
+        return onnx.load(path)
 
 
 def write_entry(path: Path, name: str, entry: dict[str, object]) -> None:
@@ -244,6 +280,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument(
         "--int8", type=Path, metavar="POOL", help="make int8 graphs, their ranges from its clips"
     )
+    parser.add_argument(
+        "--sigma", action="store_true", help="change only the sigma of the graphs in --out"
+    )
     given = parser.parse_args(arguments)
     for chatty in ("torch.onnx", "onnxscript", "onnx_ir"):
         logging.getLogger(chatty).setLevel(logging.ERROR)
@@ -253,6 +292,9 @@ def main(arguments: list[str] | None = None) -> None:
         with progress_bar(counted=False) as progress:
             # After the bar has begun: lines of the log are then written above it.
             logging.basicConfig(level=logging.INFO, format="%(message)s")
+            if given.sigma:
+                export_sigma(run, load_config(run.config_name), given.out)
+                return
             export_run(
                 run,
                 load_config(run.config_name),
@@ -260,7 +302,7 @@ def main(arguments: list[str] | None = None) -> None:
                 int8_clips=int8_clips,
                 progress=progress,
             )
-    except (ConfigError, FileNotFoundError, RunError) as error:
+    except (ConfigError, FileNotFoundError, ManifestError, RunError) as error:
         sys.exit(f"vergence_models.export: {error}")
     except KeyboardInterrupt:
         sys.exit(130)

@@ -25,6 +25,7 @@ STRUCTURE = {
     ),
     "begin_1": ("4742a137b0e9540dc07112dfe6cafee6c95b4f108672b32be4eb7b021a0cfd89",),
     "iterate": ("11c16b3006fd2be8a5394ca4fd818d4d76567d16686b5c09c8072c0b1feea55c",),
+    "sigma": ("1e70ee55621e727d391628e54c6a69a9949639df5b5304316fccffac4973fa8e",),
     "end": ("10fa2b20e4a71d23638585e50aa2a50798be007eee32169b0e80cb94681aacdf",),
 }
 # Operators that pass on their values. How often they do depends on the graph round a part.
@@ -108,6 +109,7 @@ class _Part:
             "begin_1": self._fine_floats,
             "iterate": self._fine_sharpness,
             "end": self._sigma,
+            "sigma": self._layers,
         }[self.kind]()
         return PartWeights(convolutions, sums, floats)
 
@@ -310,6 +312,18 @@ class _Part:
         ]
         return [np.array(values, np.float32)]
 
+    def _layers(self) -> list[NDArray[np.float32]]:
+        """Weights and then biases of each layer, in their order."""
+        layers = [node for node in self.nodes if node.op_type == "Conv"]
+        if len(layers) != 2:
+            raise UnsupportedWeights(f"{self.prefix} has {len(layers)} layers, not 2")
+        return [
+            np.concatenate(
+                [self._constant(name).reshape(-1) for name in layer.inputs[1:3]], dtype=np.float32
+            )
+            for layer in layers
+        ]
+
 
 def read_weights(
     graph: Graph, *, iterations: Sequence[int], begin: str = "", end: str = "end"
@@ -333,8 +347,10 @@ def read_weights(
         sharpness,
         np.array([*pairs, *means], np.float32),
     ]
+    last = _Part(graph, end, "end").weights()
+    sigma = _Part(graph, "sigma", "sigma").weights()
     return LiteWeights(
         PartWeights([*wide.convolutions, *narrow.convolutions], narrow.sums, floats),
         [_Part(graph, f"iterate_{number}", "iterate").weights() for number in iterations],
-        _Part(graph, end, "end").weights(),
+        PartWeights(last.convolutions, last.sums, [*last.floats, *sigma.floats]),
     )

@@ -28,7 +28,7 @@ class Estimate(ABC):
     """The result of one step; a tier adds the inner estimates that its training supervises too."""
 
     disparity: Tensor  # float32 [B, H, W], px > 0
-    sigma: Tensor  # float32 [B, H, W], px: half of the errors lie within sigma ln 2
+    sigma: Tensor  # float32 [B, H, W], px: the expected absolute error
 
     @abstractmethod
     def loss(self, truth_px: Tensor, max_disparity_px: int) -> Tensor:

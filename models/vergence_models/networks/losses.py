@@ -73,8 +73,8 @@ def doubt_loss(error_px: Tensor, sigma_px: Tensor) -> Tensor:
     return loss
 
 
-def sigma_loss(disparity: Tensor, sigma: Tensor, truth_px: Tensor, max_disparity_px: int) -> Tensor:
-    """The loss of sigma against ``truth_px``, all [B, H, W], a scalar.
+def judged_error(disparity: Tensor, truth_px: Tensor, max_disparity_px: int) -> Tensor:
+    """The error that sigma is to expect, px, of the shape of both, [B, H, W].
 
     A negative truth says that the images do not show the disparity, and is one that is possible.
     The error of a truth beyond the range counts :data:`BEYOND_PX` at least: no value can be right.
@@ -82,7 +82,12 @@ def sigma_loss(disparity: Tensor, sigma: Tensor, truth_px: Tensor, max_disparity
     # Sigma learns from the error, and must not buy itself a better one.
     error = (disparity.detach() - truth_px.abs()).abs()
     beyond = truth_px.abs() >= max_disparity_px
-    error = torch.where(beyond, error.clamp(min=BEYOND_PX), error)
+    return torch.where(beyond, error.clamp(min=BEYOND_PX), error)
+
+
+def sigma_loss(disparity: Tensor, sigma: Tensor, truth_px: Tensor, max_disparity_px: int) -> Tensor:
+    """The loss of sigma against ``truth_px`` as :func:`judged_error` has it, a scalar."""
+    error = judged_error(disparity, truth_px, max_disparity_px)
     return masked_mean(doubt_loss(error, sigma), (truth_px != 0).to(error.dtype))
 
 

@@ -20,8 +20,14 @@ from vergence_models.onnx_export.modules import (
     StepModule,
     cells,
 )
-from vergence_models.onnx_export.stitch import PLAIN, TAKES_PLACE, RefinementAt2x, StepParts
-from vergence_proto.model_io import LEFT, RIGHT
+from vergence_models.onnx_export.stitch import (
+    PLAIN,
+    RAW_SIGMA,
+    TAKES_PLACE,
+    RefinementAt2x,
+    StepParts,
+)
+from vergence_proto.model_io import LEFT, RIGHT, SIGMA
 
 NARROW = ("pairs", "context4", "context8", "context16")
 GIVEN = (*CostFeatures._fields, *NARROW)
@@ -58,6 +64,14 @@ class End(StepModule[LiteNetwork]):
         disparity, hidden, doubt, features = inputs
         refined = Refined(disparity, doubt, features)
         return *self.network.refinement.enlarged(refined), disparity, hidden
+
+
+class Sigma(StepModule[LiteNetwork]):
+    """Sigma by the ambiguity of the match; the last part of every step."""
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        raw, disparity, scores = inputs
+        return (self.network.sigma_head(raw, disparity, scores),)
 
 
 class Enter(StepModule[LiteNetwork]):
@@ -117,9 +131,34 @@ def parts_of(network: LiteNetwork) -> StepParts[GraphPart]:
             answer,
             tuple(cells(stride, scale) for scale in (4, 8, 4, 4)),
             (*moving, "doubt", "features4"),
-            contract.output_names,
+            found_names(contract),
         ),
         at_2x=refine_at_2x(network),
+        sigma=sigma_part(network),
+    )
+
+
+def found_names(contract: StepContract) -> tuple[str, ...]:
+    """The outputs of ``end``: those of a step, with the refinement's own sigma."""
+    return tuple(RAW_SIGMA if name == SIGMA else name for name in contract.output_names)
+
+
+def sigma_part(network: LiteNetwork) -> GraphPart:
+    """Sigma of the result, from that of the refinement, the answer and the matching scores."""
+    stride = network.config.stride
+    contract = StepContract.of(network)
+    left, _, _, disparity, _ = contract.inputs
+    height, width = left.shape[1:3]
+    raw = torch.ones(2, height, width)
+    scores = torch.zeros(2, network.bins, height // 8, width // 8)
+    answer, *_ = (each.output_name for each in network.state_tensors)
+    image: Sizes = {0: BATCH, 1: stride * ROWS, 2: stride * COLUMNS}
+    return GraphPart(
+        Sigma(network),
+        (raw, disparity, scores),
+        (image, cells(stride, 4), cells(stride, 8)),
+        (RAW_SIGMA, answer, "fixed"),
+        (SIGMA,),
     )
 
 
@@ -127,7 +166,7 @@ def refine_at_2x(network: LiteNetwork) -> RefinementAt2x[GraphPart]:
     """The parts that go to twice the size and back."""
     contract = StepContract.of(network)
     (left, right, _, *state), (image, *_) = contract.inputs, contract.sizes
-    given, outputs = contract.input_names, contract.output_names
+    given, outputs = contract.input_names, found_names(contract)
     enter, (height, width) = Enter(network), left.shape[1:3]
     larger = enter.examples(left, right, *state)
     maps = [torch.zeros(2, height, width) for _ in range(2)]

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 from onnx import ModelProto, NodeProto, TensorProto
 
+from vergence_models.onnx_export.stitch import SIGMA_PART
+
 # Operators that pass on their values, and so their scale, unchanged.
 COPYING_OPS = frozenset(
     {"Gather", "GatherElements", "Reshape", "Squeeze", "Transpose", "Unsqueeze"}
@@ -72,6 +74,8 @@ def plan_quantization(model: ModelProto) -> QuantizationPlan:
     }
     for node in model.graph.node:  # in the order they run in
         result = node.output[0]
+        if node.name.startswith(f"{SIGMA_PART}."):
+            continue  # sigma spans five orders of magnitude, and the part is small
         if node.op_type == "Conv" and node.input[1] in constants:
             few = constants[node.input[1]].dims[1] < MIN_CHANNELS
             if few and node.input[0] not in images:

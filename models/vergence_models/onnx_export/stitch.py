@@ -20,6 +20,8 @@ SMALL_BYTES = 1024  # such tensors stay in the graph: shapes and scalars that ru
 ALIGNMENT = 4096  # runtimes map whole pages
 TAKES_PLACE = "to_"
 PLAIN = "plain_"  # prefix of the outputs at 1x, when iterations at 2x follow
+RAW_SIGMA = "raw_sigma"  # the sigma that ``end`` finds, where a part for sigma follows
+SIGMA_PART = "sigma"
 
 
 class RefinementAt2x(NamedTuple, Generic[T]):
@@ -46,6 +48,7 @@ class StepParts(NamedTuple, Generic[T]):
     iterate: T
     end: T
     at_2x: RefinementAt2x[T] | None = None
+    sigma: T | None = None  # from raw_sigma, outputs of ``end`` and of the first graph, to sigma
 
 
 def stitched(parts: StepParts[ModelProto], kind: StepKind) -> ModelProto:
@@ -69,7 +72,42 @@ def stitched(parts: StepParts[ModelProto], kind: StepKind) -> ModelProto:
     else:
         line.add("end", parts.end, last=True)
     line.model.graph.output.extend(parts.end.graph.output)
-    return line.model
+    return line.model if parts.sigma is None else with_sigma(line.model, parts.sigma)
+
+
+def with_sigma(model: ModelProto, part: ModelProto) -> ModelProto:
+    """The same step with this part for sigma, in the place of one that it may have.
+
+    The part also takes outputs of the first graph of ``begin``, at the plain size. ``model`` may be
+    a whole step or the last of its stages, and its convolutions may be int8.
+    """
+    (found,) = part.graph.output
+    model = ModelProto.FromString(model.SerializeToString())
+    graph = model.graph
+    made = {name for node in graph.node for name in node.output}
+    if RAW_SIGMA not in made:
+        # A step of before there was such a part: its sigma is what the part takes.
+        for node in graph.node:
+            node.output[:] = [RAW_SIGMA if name == found.name else name for name in node.output]
+    kept = [node for node in graph.node if not node.name.startswith(f"{SIGMA_PART}.")]
+    weights = [each for each in graph.initializer if not each.name.startswith(f"{SIGMA_PART}.")]
+    del graph.node[:], graph.initializer[:]
+    graph.node.extend(kept)
+    graph.initializer.extend(weights)
+    outside = {entry.name for entry in (*graph.input, *graph.output)} | made | {RAW_SIGMA}
+    names = {
+        entry.name: entry.name if entry.name in outside else f"begin_0.{entry.name}"
+        for entry in part.graph.input
+    }
+    names |= {entry.name: f"{SIGMA_PART}.{entry.name}" for entry in part.graph.initializer}
+    for node in part.graph.node:
+        names |= {name: f"{SIGMA_PART}.{name}" for name in node.output if name}
+    names[found.name] = found.name
+    graph.node.extend(renamed(node, names, SIGMA_PART) for node in part.graph.node)
+    graph.initializer.extend(relabelled(entry, names) for entry in part.graph.initializer)
+    for entry in graph.output:
+        entry.name = found.name if entry.name == RAW_SIGMA else entry.name
+    return model
 
 
 class _GraphBuilder:

@@ -172,7 +172,7 @@ def _nothing(height: int, width: int, random: np.random.Generator) -> Tensor:
     )
     image = np.full((height, width, 3), level)
     if kind == "gradient":
-        across, down = random.uniform(-40, 40, 2)
+        across, down = random.uniform(-120, 120, 2)
         image += (across * np.linspace(-1, 1, width))[:, None]
         image += (down * np.linspace(-1, 1, height))[:, None, None]
     sigma = random.uniform(8, 60) if kind == "noise" else random.choice([0.0, random.uniform(0, 4)])

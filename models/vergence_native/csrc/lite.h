@@ -17,6 +17,8 @@ enum {
     SIXTEENTH = 64,
     CELL_INPUTS = 32, /* inputs of the recurrent cell besides the hidden state */
     SURFACES = 3,
+    MEASURES = 12,    /* of the ambiguity of the match, for sigma */
+    SIGMA_HIDDEN = 16,
     TAPS = 5,
     CENSUS_TAPS = 36,
     STRIDE = 32,
@@ -75,7 +77,7 @@ enum { SHARE_BESIDE, SHARE_OTHER, SHARE_CORNER, END_CONVS };
 enum { COARSE_CENSUS_L, COARSE_CENSUS_R, FINE_CENSUS_L, FINE_CENSUS_R, COARSE_SHARPNESS, PAIRS,
        BEGIN_FLOATS };
 enum { FINE_SHARPNESS, ITERATE_FLOATS };
-enum { SIGMA, END_FLOATS };
+enum { SIGMA, SIGMA_ENTER, SIGMA_LEAVE, END_FLOATS };
 enum { MAX_FLOATS = 8 };
 
 typedef struct {
@@ -102,6 +104,8 @@ typedef struct {
     Conv conv[END_CONVS];
     int has[END_FLOATS];
     float sigma[4]; /* factor of doubt, least and largest logarithm, factor of the exponential */
+    float enter[SIGMA_HIDDEN * (MEASURES + 1)]; /* weights [output][input], then the biases */
+    float leave[2 * (SIGMA_HIDDEN + 1)];
 } End;
 
 typedef struct {
@@ -139,6 +143,7 @@ typedef struct {
     float *hidden;                              /* [h8][w8][HIDDEN] */
     float *best, *best_log, *confidence, *top;  /* [h8][p8] */
     float *fills, *d8;                          /* [3][h8][p8], [h8][p8] */
+    float *measures, *factors;                  /* [MEASURES][h8][p8], [2][h8][p8] */
     float *plain, *carried, *cost, *wide, *taps, *apart, *d4, *phase, *doubt; /* [planes][h4][p4] */
     char *scratch; /* workers times scratch_size */
     size_t scratch_size;

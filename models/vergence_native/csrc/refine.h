@@ -1,7 +1,7 @@
 /* An iteration at 1/4: choose among nearby surfaces, fit sub-pixel; then up to full size. */
 #ifndef VERGENCE_REFINE_H
 #define VERGENCE_REFINE_H
-#include "search.h"
+#include "ambiguity.h"
 
 enum { BLOCKS_OF_COLUMNS = 8, CELLS_BEFORE = 50 }; /* the window of right entries that a cell may read */
 
@@ -330,11 +330,12 @@ static void enlarge_row(void *context, int y, int worker) {
         for (int r = 0; r < 4; r++)
             memcpy(out + (size_t)r * wide + 4 * x, pixel + 4 * r, 4 * sizeof(float));
     }
-    const float *doubt = plane4(k->doubt, k, 0, y);
+    const float *raw = plane4(k->doubt, k, 0, y), *gain = k->factors + (ptrdiff_t)(y / 2) * k->p8;
+    const float *floor_px = gain + (ptrdiff_t)k->h8 * k->p8;
     float *size = share[0];
     int bad = 0;
     for (int x = 0; x < w; x++)
-        size[x] = own_exp(clamped(doubt[x] * e->sigma[0], e->sigma[1], e->sigma[2])) * e->sigma[3];
+        size[x] = raw[x] * gain[x / 2] + floor_px[x / 2];
     for (int r = 0; r < 4; r++)
         for (int x = 0; x < w; x++)
             for (int i = 0; i < 4; i++)
@@ -355,6 +356,9 @@ static void hidden_out(void *context, int c, int worker) {
 }
 
 static void finish(Step *s) {
+    pool_run(s->pool, ambiguity_row, s, s->space->h8);
+    pool_run(s->pool, surroundings, s, 4);
+    pool_run(s->pool, factors_row, s, s->space->h8);
     pool_run(s->pool, enlarge_row, s, s->space->h4);
     pool_run(s->pool, hidden_out, s, HIDDEN);
 }

@@ -272,8 +272,11 @@ VN_EXPORT int vn_model_floats(Model *m, int part, int index, const float *values
         wanted = counts[index];
         has = &b->has[index];
     } else if (part == END_PART && index < END_FLOATS) {
-        out = m->end.sigma;
-        wanted = 4;
+        End *e = &m->end;
+        float *all[END_FLOATS] = {e->sigma, e->enter, e->leave};
+        const int counts[END_FLOATS] = {4, SIGMA_HIDDEN * (MEASURES + 1), 2 * (SIGMA_HIDDEN + 1)};
+        out = all[index];
+        wanted = counts[index];
         has = &m->end.has[index];
     } else if (part >= FIRST_ITERATION && part < FIRST_ITERATION + m->iterations && index < ITERATE_FLOATS) {
         Iteration *n = &m->iteration[part - FIRST_ITERATION];
@@ -351,7 +354,8 @@ VN_EXPORT int vn_model_finish(Model *m) {
         complete &= m->begin.has[i];
     for (int i = 0; i < END_CONVS; i++)
         complete &= m->end.conv[i].is_set;
-    complete &= m->end.has[SIGMA];
+    for (int i = 0; i < END_FLOATS; i++)
+        complete &= m->end.has[i];
     for (int n = 0; n < m->iterations; n++) {
         for (int i = 0; i < ITERATE_CONVS; i++)
             complete &= m->iteration[n].conv[i].is_set;

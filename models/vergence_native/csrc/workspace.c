@@ -40,6 +40,8 @@ static size_t scratch_size(const Workspace *k) {
     most = larger(most, (size_t)COST * ((size_t)(k->h16 + 2) * (w16 + 2) + (size_t)(k->h32 + 2) * (size_t)(k->w32 + 2))
                             + 4 * w16 + 3 * COST * w16 + 64 + f * p8);                      /* filter_bin */
     most = larger(most, f * (6 * plane + p8 + 64));                                         /* smooth_fill, extreme */
+    most = larger(most, f * (9 * p8 + 64 + plane));                                         /* ambiguity_row, surroundings */
+    most = larger(most, p8 * f * (SIGMA_HIDDEN + 2));                                       /* factors_row */
     most = larger(most, p8 * (f * 40 + 64 * 2 + 1 + HIDDEN));                               /* update_row */
     most = larger(most, p4 * (f * 20 + 12 + 3 * FINE + LANES) + 4096);                      /* rows at 1/4 */
     most = larger(most, p4 * (LANES + f * (3 + 3 * LANES)) + 6 * LANES * f);                /* enlarge_row */
@@ -88,6 +90,8 @@ static size_t arrange(Workspace *k, char *memory) {
     k->top = floats(l, plane8);
     k->fills = floats(l, 3 * plane8);
     k->d8 = floats(l, plane8);
+    k->measures = floats(l, MEASURES * plane8);
+    k->factors = floats(l, 2 * plane8);
     k->plain = floats(l, plane4);
     k->carried = floats(l, plane4);
     k->cost = floats(l, SURFACES * plane4);

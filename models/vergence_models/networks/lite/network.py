@@ -13,7 +13,7 @@ the same frame seen again, and a network that improves over frames also improves
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -24,6 +24,7 @@ from vergence_models.config import LiteNetworkConfig
 from vergence_models.networks.base import Estimate, State, StepOutput, StereoNetwork
 from vergence_models.networks.cost_volume import whole_rows
 from vergence_models.networks.layers import CensusDescriptor, added, all_pairs, banded
+from vergence_models.networks.lite.ambiguity import SigmaHead
 from vergence_models.networks.lite.coarse import (
     BIN_PX,
     CoarseUpdate,
@@ -112,6 +113,8 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         self.refinement = Refinement(config)
         self.near = near_columns(config.max_disparity_px)
         self.bins = config.max_disparity_px // BIN_PX
+        # Last: the optimizer's state is by the order of the weights, and older runs lack these.
+        self.sigma_head = SigmaHead()
 
     @property
     def state_tensors(self) -> tuple[StateTensor, ...]:
@@ -126,11 +129,28 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
         iterations: int,
     ) -> tuple[LiteEstimate, LiteState]:
         following = self.moved(LiteState(*state), uvd_curr_from_prev)
-        return self.iterated(self.search(left, right), following, iterations)
+        matching = self.search(left, right)
+        estimate, following = self.iterated(matching, following, iterations)
+        scores = matching.cost_features.fixed
+        sigma = self.sigma_head(estimate.sigma, following.disparity, scores)
+        return replace(estimate, sigma=sigma), following
+
+    def cold_step(
+        self, left: Tensor, right: Tensor, iterations: int, *, at_2x: int = 0
+    ) -> StepOutput:
+        """As in the base class. The ambiguity is that of the plain size: it has the full range."""
+        matching = self.search(left, right)
+        nothing = LiteState(*self.cold_state(*left.shape[:3]))
+        estimate, state = self.iterated(matching, nothing, iterations - at_2x)
+        found = StepOutput(estimate.disparity, estimate.sigma, state)
+        found = self.refine_at_2x(left, right, found, at_2x) if at_2x else found
+        sigma = self.sigma_head(found.sigma, found.state[0], matching.cost_features.fixed)
+        return found._replace(sigma=sigma)
 
     def refine_at_2x(
         self, left: Tensor, right: Tensor, found: StepOutput, iterations: int
     ) -> StepOutput:
+        """As in the base class; sigma is the refinement's, before and after."""
         search = self.search(larger_image(left), larger_image(right))
         state = LiteState(*larger_state(*found.state))
         estimate, state = self.iterated(search, state, iterations)
@@ -140,7 +160,10 @@ class LiteNetwork(StereoNetwork[LiteNetworkConfig]):
     def iterated(
         self, matching: MatchingFeatures, state: LiteState, iterations: int
     ) -> tuple[LiteEstimate, LiteState]:
-        """The estimate after so many iterations, from a state in the view of this frame."""
+        """The estimate after so many iterations, from a state in the view of this frame.
+
+        Its sigma is the refinement's own, without the ambiguity of the match.
+        """
         estimates: list[CoarseEstimate] = []
         for _ in range(iterations):
             found = self.iterate(matching, state)
