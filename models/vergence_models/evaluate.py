@@ -5,7 +5,7 @@
 
 Every method sees the same frames in the same run. Prints Markdown (also written beside the JSON),
 and with ``--plots`` draws cold-start curves and the calibration of sigma. ``--no-evidence`` adds
-the network's confidence in images that do not show the disparity.
+the first model's confidence in images that do not show the disparity.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from vergence_models.evaluation.stepping import (
 from vergence_models.progress import no_progress, progress_bar
 from vergence_models.training.validation import filmed
 from vergence_proto.datasets import DatasetError, find_sources, open_source
-from vergence_proto.model_io import ManifestError
+from vergence_proto.model_io import ManifestError, folder_of_model, user_models_dir
 
 WEIGHTS = Path(__file__).parent / "weights"
 
@@ -53,11 +53,11 @@ Results = dict[str, dict[str, MetricAccumulator]]  # group -> method -> its figu
 
 
 def methods_for(network: SteppedNetwork, *, thorough: bool) -> list[Method]:
-    """The network warm and cold, and SGBM; ``thorough`` adds no motion and noisy motion."""
-    name, most = network.card.name, max(network.card.graphs)
+    """The network warm and cold; ``thorough`` adds no motion and noisy motion."""
+    name, fewest, most = network.card.name, min(network.card.graphs), max(network.card.graphs)
     if not network.card.recurrent:  # poses do not matter to it either
-        return [single_frame_method(network, name, most), *sgbm_methods()]
-    warm = warm_method(network, name, 1, cold=most)
+        return [single_frame_method(network, name, most)]
+    warm = warm_method(network, name, fewest, cold=most)
     methods = [warm, single_frame_method(network, name, most)]
     if thorough:
         methods += [
@@ -67,7 +67,7 @@ def methods_for(network: SteppedNetwork, *, thorough: bool) -> list[Method]:
                 lambda footage: with_pose_noise(footage, deg=0.3, m=0.001),
             ),
         ]
-    return methods + sgbm_methods()
+    return methods
 
 
 def footage_on_disk(sources: list[str]) -> Iterator[Footage]:
@@ -239,8 +239,10 @@ def draw_plots(results: Results, folder: Path) -> None:
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="vergence_models.evaluate", description=__doc__)
-    parser.add_argument("--weights", type=Path, default=WEIGHTS, help="folder with a manifest")
-    parser.add_argument("--model", default="lite")
+    parser.add_argument(
+        "--weights", type=Path, help="folder with a manifest; default: as vergence serve"
+    )
+    parser.add_argument("--model", nargs="+", default=["lite"], help="also of vergence models add")
     parser.add_argument("--data", nargs="*", default=[], help="KIND:PATH, as vergence run takes it")
     parser.add_argument("--pool", type=Path, nargs="*", default=[], help="held-out clips")
     parser.add_argument("--clips", type=int, default=32, help="clips of each pool")
@@ -257,10 +259,15 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         # Before the graphs are loaded, which takes seconds.
         sources = [source for spec in given.data for source in find_sources(spec)]
-        network = OnnxNetwork(given.weights, given.model, threads=given.threads)
+        folders = [given.weights] if given.weights else [WEIGHTS, user_models_dir()]
+        networks = [
+            OnnxNetwork(folder_of_model(name, folders), name, threads=given.threads)
+            for name in dict.fromkeys(given.model)
+        ]
+        methods = [m for each in networks for m in methods_for(each, thorough=given.thorough)]
         with progress_bar() as progress:
             results = evaluate(
-                methods_for(network, thorough=given.thorough),
+                methods + sgbm_methods(),
                 gather(sources, given.pool, given.clips),
                 progress=progress,
                 count=len(sources) + sum(min(given.clips, len(ClipPool(p))) for p in given.pool),
@@ -271,7 +278,7 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(130)
     tables, values = markdown(results), as_json(results)
     if given.no_evidence:
-        doubts = doubts_of(network)
+        doubts = doubts_of(networks[0])
         tables += "\n" + doubt_table(doubts)
         values["no evidence"] = {name: dataclasses.asdict(found) for name, found in doubts.items()}
     sys.stdout.write(tables)

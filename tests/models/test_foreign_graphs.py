@@ -25,6 +25,9 @@ from tests.support.foreign_graphs import (
     two_images,
     written,
 )
+from vergence_models.evaluate import evaluate, methods_for
+from vergence_models.evaluation.methods import sgbm_methods
+from vergence_models.evaluation.stepping import Footage, FootageView
 from vergence_models.foreign.adding import Added, add_model, check_model
 from vergence_models.foreign.command import models
 from vergence_models.foreign.compose import UNSEEN_PX
@@ -33,8 +36,14 @@ from vergence_models.foreign.files import read_manifest, write_model
 from vergence_models.foreign.guess import Given
 from vergence_models.foreign.published import PUBLISHED
 from vergence_models.foreign.textures import Scene, scene
+from vergence_models.studies.networks import gather_networks
 from vergence_proto.geometry import RectifiedRig
-from vergence_proto.model_io import MANIFEST_NAME, load_model_card
+from vergence_proto.model_io import (
+    MANIFEST_NAME,
+    ManifestError,
+    load_model_card,
+    user_models_dir,
+)
 from vergence_service.app.server import make_model
 from vergence_service.inference.model import Step, StepResult, StereoView
 from vergence_service.inference.onnx_model import OnnxStereoModel
@@ -322,3 +331,26 @@ def test_the_command_adds_lists_checks_and_the_server_finds_the_model(
     assert load_model_card(tmp_path / "vergence" / "models", "theirs") == model.card
     contracts = run.invoke(models, ["contracts"])
     assert all(name in contracts.output for name in PUBLISHED)
+
+
+def test_a_model_that_was_added_is_a_row_beside_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    path = written(LAYOUTS["igev"].make(), tmp_path / "igev.onnx")
+    add(user_models_dir(), path, "theirs", max_disparity_px=DISPARITIES)
+    [studied] = gather_networks([], [], threads=1, models=["theirs"])
+    assert (studied.warm, studied.single_frame, studied.warps) == ((), (1,), False)
+    assert "trained by its authors" in studied.training.words
+    with pytest.raises(ManifestError, match="has no model 'other'; it has theirs"):
+        gather_networks([], [], threads=1, models=["other"])
+    pair = scene(HEIGHT, WIDTH, 6, 30, seed=5)
+    footage = Footage("pair", RIG, [FootageView(pair.left, pair.right, None, pair.truth_px)])
+    methods = methods_for(studied.network, thorough=True) + sgbm_methods()
+    found = evaluate(methods, iter([("pair", footage)]))["pair"]
+    assert list(found) == [
+        "theirs, every frame cold, 1 iteration",
+        "SGBM, full size",
+        "SGBM, half size",
+    ]
+    assert found["theirs, every frame cold, 1 iteration"].summary()["epe"] < 0.5

@@ -58,6 +58,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     add("--render", action="store_true", help="write Markdown and plots of FILE again, run nothing")
     add("--studies", nargs="*", metavar="NAME", help=f"some of {', '.join(STUDIES)}; default: all")
     add("--weights", type=Path, nargs="+", default=[WEIGHTS], help="folders with a manifest")
+    add("--model", nargs="*", default=[], help="models of vergence models add, a row each")
     add("--run", type=Path, nargs="*", default=[], help="training runs, computed by PyTorch")
     add("--data", nargs="*", default=[], help="KIND:PATH, each a table of its own")
     add("--kitti", help="KIND:PATH of KITTI odometry with truth, by the paper's protocol")
@@ -122,7 +123,9 @@ def main(arguments: list[str] | None = None) -> None:
         if given.render:
             report(tables, given.json)
             return
-        networks = gather_networks(given.weights, given.run, threads=given.threads)
+        networks = gather_networks(
+            given.weights, given.run, threads=given.threads, models=given.model
+        )
         with Progress(*columns, console=Console(stderr=True)) as progress:
             bench = Bench(
                 networks,

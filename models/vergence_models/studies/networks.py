@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from vergence_models.evaluation.methods import Method, single_frame_method, warm
 from vergence_models.evaluation.stepping import OnnxNetwork, SteppedNetwork
 from vergence_models.evaluation.torch_stepping import TorchNetwork
 from vergence_models.training.runs import Run, Validation, read_run
-from vergence_proto.model_io import MANIFEST_NAME, ManifestError
+from vergence_proto.model_io import MANIFEST_NAME, ManifestError, user_models_dir
 
 TIERS = ("full", "fast", "lite")
 WARM = (1, 2, 5)  # the counts the paper tabulates
@@ -44,6 +44,8 @@ class TrainingSummary:
 
     @property
     def words(self) -> str:
+        if not self.frames:
+            return f"{self.name}: trained by its authors; run by {self.runtime}"
         return (
             f"{self.name}: {self.frames:,} frames seen in {self.minutes:g} minutes on "
             f"{self.device}; run by {self.runtime}"
@@ -79,8 +81,10 @@ class StudiedNetwork:
         return replace(method, label=f"{method.label}, {cold} on the first frame")
 
 
-def exported(folder: Path, *, threads: int) -> list[StudiedNetwork]:
-    """Every model of a folder of weights. Raises ManifestError."""
+def exported(
+    folder: Path, *, threads: int, only: Collection[str] | None = None
+) -> list[StudiedNetwork]:
+    """Every model of a folder of weights, or only those named. Raises ManifestError."""
     path = folder / MANIFEST_NAME
     try:
         entries: dict[str, Any] = json.loads(path.read_text("utf-8"))["models"]
@@ -89,7 +93,12 @@ def exported(folder: Path, *, threads: int) -> list[StudiedNetwork]:
     except (json.JSONDecodeError, KeyError) as error:
         raise ManifestError(f"{path}: expected a manifest of models: {error!r}") from None
     found = []
-    for name, entry in entries.items():
+    for name in entries if only is None else only:
+        if name not in entries:
+            raise ManifestError(
+                f"{path} has no model {name!r}; it has {', '.join(sorted(entries))}"
+            )
+        entry = entries[name]
         network = OnnxNetwork(folder, name, threads=threads)
         counts = network.card.graphs
         found.append(
@@ -97,13 +106,21 @@ def exported(folder: Path, *, threads: int) -> list[StudiedNetwork]:
                 name,
                 network,
                 TrainingSummary.of(name, "onnxruntime", entry.get("training", {})),
-                warm=tuple(n for n in WARM if n in counts) if network.card.recurrent else (),
+                warm=_warm_counts(network),
                 single_frame=tuple(n for n in SINGLE_FRAME if n in counts) or (max(counts),),
                 cold=network.card.iterations_at_most(COLD),
                 warps=network.card.recurrent and entry.get("architecture", {}).get("warp", True),
             )
         )
     return found
+
+
+def _warm_counts(network: SteppedNetwork) -> tuple[int, ...]:
+    """The counts of warm steps to study; none if the network has no memory."""
+    if not network.card.recurrent:
+        return ()
+    counts = network.card.graphs
+    return tuple(n for n in WARM if n in counts) or (min(counts),)
 
 
 def trained(run: Run, beside: Iterable[StudiedNetwork], *, threads: int) -> StudiedNetwork:
@@ -125,8 +142,12 @@ def trained(run: Run, beside: Iterable[StudiedNetwork], *, threads: int) -> Stud
     )
 
 
-def gather_networks(weights: list[Path], runs: list[Path], *, threads: int) -> list[StudiedNetwork]:
+def gather_networks(
+    weights: list[Path], runs: list[Path], *, threads: int, models: Sequence[str] = ()
+) -> list[StudiedNetwork]:
     """All of them, ordered by tier; a model in two folders is taken from the first.
+
+    ``models`` are names of models that the user has added with ``vergence models add``.
 
     Raises ManifestError, RunError, ConfigError.
     """
@@ -135,6 +156,8 @@ def gather_networks(weights: list[Path], runs: list[Path], *, threads: int) -> l
     for folder in weights:
         for studied in exported(folder, threads=threads):
             found.setdefault(studied.name, studied)
+    for studied in exported(user_models_dir(), threads=threads, only=models) if models else ():
+        found.setdefault(studied.name, studied)
     for run in read:
         studied = trained(run, list(found.values()), threads=threads)
         found.setdefault(studied.name, studied)
