@@ -80,6 +80,19 @@ class StateTensor:
 
 
 @dataclass(frozen=True, slots=True)
+class StepMemory:
+    """An upper bound of the memory that one step takes while it runs, by its size."""
+
+    beside_bytes: int  # for any size
+    bytes_a_pixel: float
+    bytes_a_pixel_and_column: float  # a volume relates pixels to columns
+
+    def of(self, height: int, width: int) -> int:
+        per_pixel = self.bytes_a_pixel + self.bytes_a_pixel_and_column * width
+        return self.beside_bytes + int(per_pixel * height * width)
+
+
+@dataclass(frozen=True, slots=True)
 class ModelCard:
     """The manifest's description of one model."""
 
@@ -92,6 +105,7 @@ class ModelCard:
     # The stages of a cold start, by number of iterations; empty if they are those of any step.
     cold_graphs: Mapping[int, Stages] = field(default_factory=dict)
     cold_max_pixels: int = 0  # larger images, at step size, start with the graphs of any step
+    step_memory: StepMemory | None = None  # of any step; None: the engine knows the network
 
     def stages(self, iterations: int, *, cold_pixels: int | None = None) -> Stages:
         """Return the graphs of a step. For a stream's first, ``cold_pixels`` is its image's size.
@@ -196,6 +210,7 @@ def load_model_card(weights_dir: Path, name: str) -> ModelCard:
         weights_sha256=hashlib.sha256(b"".join(digests)).hexdigest(),
         cold_graphs=cold_graphs,
         cold_max_pixels=entry.get("cold_max_pixels", 0),
+        step_memory=StepMemory(**entry["step_memory"]) if entry.get("step_memory") else None,
     )
 
 

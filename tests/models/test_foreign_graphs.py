@@ -327,6 +327,8 @@ def test_the_command_adds_lists_checks_and_the_server_finds_the_model(
     assert len(refused.output.splitlines()) == 1
     model = make_model(load_settings(flags={"model.name": "theirs"}))
     assert model.card.max_disparity_px == DISPARITIES
+    volume = 4 * DISPARITIES * HEIGHT * WIDTH  # bytes of the costs of every disparity
+    assert volume < model.step_bytes(HEIGHT, WIDTH, 1, cold=True) < 60 * volume
     assert not model.card.recurrent
     assert load_model_card(tmp_path / "vergence" / "models", "theirs") == model.card
     contracts = run.invoke(models, ["contracts"])

@@ -8,16 +8,18 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from vergence_models.data.clips import StereoClips
 from vergence_proto.datasets import DatasetError, StereoSource
 from vergence_proto.geometry import Pose, RectifiedRig, uvd_curr_from_prev
 from vergence_proto.model_io import ModelCard, Stages, load_model_card
+
+if TYPE_CHECKING:  # it needs torch, and networks of others are stepped without it
+    from vergence_models.data.clips import StereoClips
 
 Image = NDArray[np.uint8]
 Plane = NDArray[np.float32]

@@ -92,7 +92,9 @@ def _add(
     with _in_one_line():
         from vergence_models.foreign.adding import add_model
         from vergence_models.foreign.contract import PIXELS, ContractError
+        from vergence_models.foreign.files import note_memory
         from vergence_models.foreign.guess import Given
+        from vergence_models.foreign.memory import measured_memory
 
         counts = iterations or ([1] if len(files) == 1 else [])
         if len(counts) != len(files) or len({*counts}) != len(counts):
@@ -126,6 +128,8 @@ def _add(
             given=given,
             unproven=unproven,
         )
+        if memory := measured_memory(folder, added.name, added.contract):
+            note_memory(folder, added.name, memory)
         _show(added)
         at = f" --weights {folder}" if weights else ""
         typer.echo(f"added to {folder}; serve it: vergence serve --model {added.name}{at}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import os
@@ -27,7 +28,7 @@ from vergence_models.foreign.compose import (
 )
 from vergence_models.foreign.contract import Contract, ContractError
 from vergence_models.foreign.trial import first_line
-from vergence_proto.model_io import MANIFEST_FORMAT, MANIFEST_NAME, ManifestError
+from vergence_proto.model_io import MANIFEST_FORMAT, MANIFEST_NAME, ManifestError, StepMemory
 
 _MOST_BYTES = (2 << 30) - (16 << 20)  # protobuf's limit of one message, with room for the names
 _NAME = re.compile(r"[a-z0-9][a-z0-9._-]*")
@@ -148,6 +149,17 @@ def write_model(
         "files": {file: _sha256(folder / file) for file in sorted(files.files)},
         "foreign": {"contract": contract.to_json(), **about},
     }
+    _replace_manifest(folder, manifest)
+
+
+def note_memory(folder: Path, name: str, memory: StepMemory) -> None:
+    """Write the memory of a step into the manifest."""
+    manifest = read_manifest(folder)
+    manifest["models"][name]["step_memory"] = dataclasses.asdict(memory)
+    _replace_manifest(folder, manifest)
+
+
+def _replace_manifest(folder: Path, manifest: dict[str, Any]) -> None:
     unfinished = folder / f"{MANIFEST_NAME}.new"
     unfinished.write_text(json.dumps(manifest, indent=1) + "\n", "utf-8")
     os.replace(unfinished, folder / MANIFEST_NAME)

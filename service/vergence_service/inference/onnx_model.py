@@ -102,6 +102,8 @@ class OnnxStereoModel:
     def step_bytes(self, height: int, width: int, iterations: int, *, cold: bool) -> int:
         height, width = self._card.step_size(height, width)
         pixels = height * width
+        if self._card.step_memory is not None:
+            return self._card.step_memory.of(height, width)
         own_graphs = iterations in self._card.cold_graphs and pixels <= self._card.cold_max_pixels
         if cold and own_graphs:
             return _bytes_of(_FROM_NOTHING, pixels, width)
