@@ -33,7 +33,7 @@ from vergence_models.foreign.command import models
 from vergence_models.foreign.compose import UNSEEN_PX
 from vergence_models.foreign.contract import Contract, ContractError
 from vergence_models.foreign.files import read_manifest, write_model
-from vergence_models.foreign.guess import Given
+from vergence_models.foreign.guess import Given, iterations_in
 from vergence_models.foreign.published import PUBLISHED
 from vergence_models.foreign.textures import Scene, scene
 from vergence_models.studies.networks import gather_networks
@@ -173,6 +173,8 @@ def test_what_the_user_says_is_not_corrected_and_nothing_is_written(tmp_path: Pa
         ({"output": "elsewhere"}, "no map called 'elsewhere', but output"),
         ({"sigma": "confidence"}, "no confidence"),
         ({"warm_start": True}, "no input for an initial flow"),
+        ({"name": "lite"}, "lite is a model of this project"),
+        ({"name": "a/b"}, "expected a name of small letters"),
         ({"like": "rafting"}, "there is no contract 'rafting'; there are raft-stereo"),
     ):
         with pytest.raises(ContractError, match=says):
@@ -356,3 +358,16 @@ def test_a_model_that_was_added_is_a_row_beside_the_others(
         "SGBM, half size",
     ]
     assert found["theirs, every frame cold, 1 iteration"].summary()["epe"] < 0.5
+
+
+@pytest.mark.parametrize(
+    ("name", "count"),
+    [
+        ("crestereo_combined_iter10_480x640", 10),
+        ("raft_32iters", 32),
+        ("igev", 1),
+        ("x_iters_2", 2),
+    ],
+)
+def test_the_iterations_of_published_files_are_in_their_names(name: str, count: int) -> None:
+    assert iterations_in(name) == count

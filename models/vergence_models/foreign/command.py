@@ -69,7 +69,9 @@ def _add(
     ] = None,
     iterations: Annotated[
         list[int] | None,
-        typer.Option(min=1, help="Number of iterations of each graph; default: 1."),
+        typer.Option(
+            min=1, help="Number of iterations of each graph; default: iterN in its name, or 1."
+        ),
     ] = None,
     warm_start: Annotated[
         bool | None,
@@ -93,10 +95,10 @@ def _add(
         from vergence_models.foreign.adding import add_model
         from vergence_models.foreign.contract import PIXELS, ContractError
         from vergence_models.foreign.files import note_memory
-        from vergence_models.foreign.guess import Given
+        from vergence_models.foreign.guess import Given, iterations_in
         from vergence_models.foreign.memory import measured_memory
 
-        counts = iterations or ([1] if len(files) == 1 else [])
+        counts = iterations or [iterations_in(path.stem) for path in files]
         if len(counts) != len(files) or len({*counts}) != len(counts):
             raise ContractError("expected a different --iterations for each file")
         for what, value, allowed in (

@@ -31,6 +31,8 @@ from vergence_models.foreign.trial import first_line
 from vergence_proto.model_io import MANIFEST_FORMAT, MANIFEST_NAME, ManifestError, StepMemory
 
 _MOST_BYTES = (2 << 30) - (16 << 20)  # protobuf's limit of one message, with room for the names
+# The server finds these before it looks into the user's folder.
+_OWN_NAMES = {"lite", "full", "fast", "sgbm", "sgbm-half"}
 _NAME = re.compile(r"[a-z0-9][a-z0-9._-]*")
 
 
@@ -76,6 +78,8 @@ def checked_name(name: str) -> str:
         raise ContractError(
             f"expected a name of small letters, digits, dots and dashes, got {name!r}; use --name"
         )
+    if name in _OWN_NAMES:
+        raise ContractError(f"{name} is a model of this project; choose another --name")
     return name
 
 

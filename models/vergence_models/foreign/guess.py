@@ -144,6 +144,12 @@ def outputs_of(contract: Contract, network: Network, given: Given) -> Contract:
     )
 
 
+def iterations_in(file_name: str) -> int:
+    """Return the number of iterations that a file's name states, as iter10 or 10iters; else 1."""
+    found = re.search(r"iters?_?(\d+)|(\d+)_?iters?", file_name, re.IGNORECASE)
+    return max(1, int(found[1] or found[2])) if found else 1
+
+
 def _inputs_of(model: ModelProto) -> list[_Input]:
     weights = {each.name for each in model.graph.initializer}
     found = []
