@@ -3,127 +3,23 @@
 An event loop runs in one background thread, which the client's ``with`` starts and ends.
 """
 
-import asyncio
-import os
-import threading
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, Self, TypeVar
+from typing import Literal, Self, TypeVar
 
 from vergence.attaching import OnLost
 from vergence.client import DepthClient
-from vergence.errors import NotOpen
 from vergence.image_format import CameraImage
 from vergence.info import ServerInfo, StreamInfo
+from vergence.loop_thread import LoopThread
 from vergence.results import DepthResult, NotSent, SessionEvent
 from vergence.session import DepthSession, WorldFromLeft
 from vergence.session_facts import SessionFacts
 from vergence.transports.addresses import DEFAULT_SERVER
-from vergence.transports.forks import FORKED
-from vergence_proto.geometry import Axes, RectifiedRig
+from vergence_proto.geometry import Axes, Matrix, Pose, RectifiedRig
 from vergence_proto.types import Delivery, ImageEncoding, OutputFormat, StereoRig
 
 Value = TypeVar("Value")
-
-
-def depth(
-    left: CameraImage,
-    right: CameraImage,
-    rig: StereoRig | RectifiedRig,
-    *,
-    server: str = DEFAULT_SERVER,
-    iterations: int = 0,
-) -> DepthResult:
-    """Compute the depth of one pair, in a stream of its own.
-
-    Parameters
-    ----------
-    left, right
-        uint8 [H, W] grey, [H, W, 3] RGB, [H, W, 4] RGBA or [H * 3/2, W] NV12, of the rig's size;
-        or the bytes of a JPEG or PNG file, which travel as they are.
-    rig
-        The cameras as they are; the server rectifies the images if the rig is not rectified.
-    server
-        The address of the server, as in :class:`DepthClient`.
-    iterations
-        Refinement iterations; 0: the server's default for a cold start.
-
-    Raises
-    ------
-    ValueError
-        ``server`` is no address of a server.
-    BadImage
-        An image has another type or shape, or is a damaged file.
-    BadShape
-        The images do not have the rig's size, or ``iterations`` is out of range.
-    BadCalibration
-        The server cannot use the rig.
-    FrameTooLarge
-        The frame has more bytes or pixels than the server accepts.
-    StreamLimit, StateMemory, Quota
-        The server has no room for another stream.
-    ModelFailed, NonFinite
-        The model failed on this pair.
-    Draining, NotReady
-        The server is shutting down, or is not ready yet.
-    ConnectionLost
-        The server cannot be reached.
-    """
-    with (
-        BlockingClient(server) as client,
-        client.open_session(rig, delivery=Delivery.EVERY, cold_iterations=iterations) as session,
-    ):
-        return session.step(left, right)
-
-
-class _LoopThread:
-    """An event loop in a thread, between :meth:`start` and :meth:`stop`."""
-
-    def __init__(self) -> None:
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._process = os.getpid()
-
-    def start(self) -> None:
-        started = threading.Event()
-        # Not a daemon: stop() ends it, and never in the middle of a callback.
-        self._thread = threading.Thread(target=self._main, args=(started,), name="vergence-client")
-        self._thread.start()
-        started.wait()
-
-    def _main(self, started: threading.Event) -> None:
-        with asyncio.Runner() as runner:  # its exit cancels and awaits the remaining tasks
-            loop = runner.get_loop()
-            self._loop = loop
-            loop.call_soon(started.set)
-            loop.run_forever()
-
-    def stop(self) -> None:
-        loop, self._loop = self._loop, None
-        if loop is not None:
-            loop.call_soon_threadsafe(loop.stop)
-            self._thread.join()
-
-    def wait(self, work: Coroutine[Any, Any, Value]) -> Value:
-        if self._process != os.getpid():  # the thread stayed behind in the other process
-            work.close()
-            raise NotOpen(FORKED)
-        if self._loop is None:
-            work.close()
-            raise NotOpen("the client is not open; write: with BlockingClient(server) as client")
-        future = asyncio.run_coroutine_threadsafe(work, self._loop)
-        try:
-            return future.result()
-        except BaseException:  # after an interrupt nobody waits for the result any more
-            future.cancel()
-            raise
-
-    def call(self, function: Callable[[], Value]) -> Value:
-        """Run a function in the loop's thread: a session must not be used from another one."""
-
-        async def run() -> Value:
-            return function()
-
-        return self.wait(run())
 
 
 class BlockingSession(SessionFacts):
@@ -133,7 +29,7 @@ class BlockingSession(SessionFacts):
     ``__enter__`` raises :class:`NotOpen` before that.
     """
 
-    def __init__(self, session: DepthSession, loop: _LoopThread, /) -> None:
+    def __init__(self, session: DepthSession, loop: LoopThread, /) -> None:
         super().__init__(session._parts)  # noqa: SLF001  the same session, for other callers
         self._session = session
         self._loop = loop
@@ -164,10 +60,11 @@ class BlockingSession(SessionFacts):
             uint8 [H, W] grey, [H, W, 3] RGB, [H, W, 4] RGBA or [H * 3/2, W] NV12, of the rig's
             size; or the bytes of a JPEG or PNG file, which travel as they are.
         world_from_left
-            The left camera's pose at mid-exposure; None: not known.
+            The left camera's pose at mid-exposure; None: interpolated, if poses were given to
+            :meth:`track`, else not known.
         capture_ns
-            ``time.monotonic_ns()`` at mid-exposure; default: now. Another clock in nanoseconds
-            will do; then the ages of results are NaN.
+            ``time.monotonic_ns()`` at mid-exposure, or the time of the session's ``clock``;
+            default: now. Another clock in nanoseconds will do; then the ages of results are NaN.
         max_age_s
             A frame that waits in the server for longer is dropped (``drops.stale``).
 
@@ -181,9 +78,10 @@ class BlockingSession(SessionFacts):
         BadImage
             An image has another type or shape, or is a damaged file.
         BadPose
-            The pose is not finite, or its rotation is not orthonormal with determinant +1.
+            The pose is not finite, or its rotation is not orthonormal with determinant +1; or the
+            frame is outside the tracked poses.
         BadShape
-            ``capture_ns`` is no whole number of 64 bits.
+            ``capture_ns`` is no whole number of 64 bits, or impossible on the session's ``clock``.
         WrongDelivery
             The session's delivery is EVERY, which must not drop frames; use :meth:`step`.
         NotOpen
@@ -301,7 +199,7 @@ class BlockingClient:
         key: str | Path | None = None,
     ) -> None:
         self._client = DepthClient(server, token=token, ca=ca, cert=cert, key=key)
-        self._loop = _LoopThread()
+        self._loop = LoopThread()
 
     def __enter__(self) -> Self:
         """Start the event loop; this does not connect yet."""
@@ -337,6 +235,9 @@ class BlockingClient:
         on_event: Callable[[SessionEvent], None] | None = None,
         on_lost: OnLost = "restart",
         link: Literal["auto", "fixed"] | None = None,
+        clock: Callable[[], int] | None = None,
+        tracked_from_left: Pose | Matrix | None = None,
+        pose_offset_s: float = 0.0,
         open_timeout_s: float = 10.0,
     ) -> BlockingSession:
         """Make a session; its ``with`` opens the stream and ends it.
@@ -381,6 +282,16 @@ class BlockingClient:
             ``jpeg_quality`` or ``output.map_step`` fix them. ``"fixed"``: send what was asked for,
             within the credit. Default: ``"auto"`` for live sessions with a server elsewhere.
             :attr:`BlockingSession.link` shows the choice.
+        clock
+            A function that returns the present time of the clock of ``capture_ns``, in nanoseconds:
+            ``time.time_ns`` for ROS, or that of your runtime. Ages are then those of this clock,
+            and a frame of an impossible time is refused. Default: ``time.monotonic_ns``.
+        tracked_from_left
+            Maps left-camera coordinates to those of the body whose poses ``session.track`` gets,
+            in the session's axes; default: the left camera itself is tracked.
+        pose_offset_s
+            The time in seconds to add to ``capture_ns`` to get the time of the frame's pose, as
+            Kalibr's ``timeshift_cam_imu``.
         open_timeout_s
             The time in seconds for which a server that cannot be reached, is not ready or has no
             room is asked again.
@@ -409,6 +320,9 @@ class BlockingClient:
             on_event=on_event,
             on_lost=on_lost,
             link=link,
+            clock=clock,
+            tracked_from_left=tracked_from_left,
+            pose_offset_s=pose_offset_s,
             open_timeout_s=open_timeout_s,
         )
         return BlockingSession(session, self._loop)

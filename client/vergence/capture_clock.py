@@ -4,11 +4,13 @@ import logging
 import math
 import operator
 import time
+from collections.abc import Callable
 
 from vergence_proto.errors import BadShape
 
 log: logging.Logger = logging.getLogger("vergence")
 
+_UNITS = ((31_557_600.0, "years"), (86_400.0, "days"), (3600.0, "hours"), (1.0, "s"))
 _INT64 = range(-(2**63), 2**63)
 # Another clock is off by years, or by the time since the machine was started: minutes at least.
 _AGES_S = (-1.0, 120.0)
@@ -17,9 +19,15 @@ _LEAST_STEP_NS = 100_000
 
 
 class CaptureClock:
-    """Checks the capture times of one session; ``live``: they should be times of this machine."""
+    """The clock of one session's frames, which checks their times.
 
-    def __init__(self, *, live: bool) -> None:
+    ``now_ns`` returns the time of that clock, and every frame must then be of it. Without one,
+    times should be those of ``time.monotonic_ns()`` if the session is ``live``.
+    """
+
+    def __init__(self, now_ns: Callable[[], int] | None = None, *, live: bool = True) -> None:
+        self._stated = now_ns is not None
+        self.now_ns: Callable[[], int] = now_ns or time.monotonic_ns
         self._latest_ns: int | None = None
         self._warn_of_steps = True
         self._warn_of_ages = live
@@ -27,14 +35,20 @@ class CaptureClock:
     def checked_ns(self, capture_ns: object) -> int:
         """Return the time; now for None. Log once what is odd about the times.
 
-        Raises BadShape: it is no whole number, or does not fit 64 bits.
+        Raises BadShape: it is no whole number, does not fit 64 bits, or is impossible on the clock
+        that was stated.
         """
         if capture_ns is None:
-            return time.monotonic_ns()
+            return _whole(self.now_ns())
         whole_ns = _whole(capture_ns)
+        if self._stated and math.isnan(self.age_s(whole_ns)):
+            raise BadShape(
+                "expected a capture_ns of the last two minutes of the session's clock, got "
+                f"{_distance(whole_ns - self.now_ns())}; state the clock of your camera as clock="
+            )
         step_ns = whole_ns - self._latest_ns if self._latest_ns is not None else 0
         self._latest_ns = whole_ns
-        if self._warn_of_ages and math.isnan(age_of(whole_ns)):
+        if self._warn_of_ages and math.isnan(self.age_s(whole_ns)):
             self._warn_of_ages = False
             log.warning("capture_ns is no time of time.monotonic_ns(): the ages of results are NaN")
         if self._warn_of_steps and 0 < step_ns < _LEAST_STEP_NS:
@@ -46,11 +60,16 @@ class CaptureClock:
             )
         return whole_ns
 
+    def age_s(self, capture_ns: int) -> float:
+        """Return the seconds since ``capture_ns``; NaN if it cannot be a time of the clock."""
+        age_s = (self.now_ns() - capture_ns) * 1e-9
+        return age_s if _AGES_S[0] < age_s < _AGES_S[1] else math.nan
 
-def age_of(capture_ns: int) -> float:
-    """Return the seconds since ``capture_ns``; NaN if it is no time of this machine's clock."""
-    age_s = (time.monotonic_ns() - capture_ns) * 1e-9
-    return age_s if _AGES_S[0] < age_s < _AGES_S[1] else math.nan
+
+def _distance(ahead_ns: int) -> str:
+    seconds = abs(ahead_ns) * 1e-9
+    unit, name = next((each for each in _UNITS if seconds >= each[0]), _UNITS[-1])
+    return f"a time {seconds / unit:.1f} {name} {'after' if ahead_ns > 0 else 'before'} its now"
 
 
 def _whole(capture_ns: object) -> int:

@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Literal, Self
 
 from vergence.attaching import OnLost, RecoveryRules
+from vergence.capture_clock import CaptureClock
 from vergence.errors import NotOpen
 from vergence.image_format import ImageFormat
 from vergence.info import ServerInfo, StreamInfo
 from vergence.info_codec import server_info_from_proto, stream_info_from_proto
 from vergence.link import LinkRules
+from vergence.pose_buffer import PoseBuffer
 from vergence.results import SessionEvent
 from vergence.session import DepthSession
 from vergence.session_facts import SessionSetup
@@ -20,7 +22,7 @@ from vergence.transports.addresses import DEFAULT_SERVER, connector, on_this_mac
 from vergence.transports.base import Transport
 from vergence.units import warn_of_baseline
 from vergence_proto import codec
-from vergence_proto.geometry import Axes, RectifiedRig
+from vergence_proto.geometry import Axes, Matrix, Pose, RectifiedRig
 from vergence_proto.types import (
     Delivery,
     ImageEncoding,
@@ -108,6 +110,9 @@ class DepthClient:
         on_event: Callable[[SessionEvent], None] | None = None,
         on_lost: OnLost = "restart",
         link: Literal["auto", "fixed"] | None = None,
+        clock: Callable[[], int] | None = None,
+        tracked_from_left: Pose | Matrix | None = None,
+        pose_offset_s: float = 0.0,
         open_timeout_s: float = 10.0,
     ) -> DepthSession:
         """Make a session; its ``async with`` opens the stream and ends it.
@@ -152,6 +157,16 @@ class DepthClient:
             ``jpeg_quality`` or ``output.map_step`` fix them. ``"fixed"``: send what was asked for,
             within the credit. Default: ``"auto"`` for live sessions with a server elsewhere.
             :attr:`DepthSession.link` shows the choice.
+        clock
+            A function that returns the present time of the clock of ``capture_ns``, in nanoseconds:
+            ``time.time_ns`` for ROS, or that of your runtime. Ages are then those of this clock,
+            and a frame of an impossible time is refused. Default: ``time.monotonic_ns``.
+        tracked_from_left
+            Maps left-camera coordinates to those of the body whose poses ``session.track`` gets,
+            in the session's axes; default: the left camera itself is tracked.
+        pose_offset_s
+            The time in seconds to add to ``capture_ns`` to get the time of the frame's pose, as
+            Kalibr's ``timeshift_cam_imu``.
         open_timeout_s
             The time in seconds for which a server that cannot be reached, is not ready or has no
             room is asked again.
@@ -162,11 +177,15 @@ class DepthClient:
             The stream id has other characters or another length.
         BadCalibration
             ``left_from_right`` is no rigid transform.
+        BadPose
+            ``tracked_from_left`` is no rigid transform.
         NotOpen
             The client is not open.
         """
         if link not in (None, "auto", "fixed"):
             raise ValueError(f"expected link as 'auto' or 'fixed', got {link!r}")
+        if tracked_from_left is not None and not isinstance(tracked_from_left, Pose):
+            tracked_from_left = Pose.from_matrix(tracked_from_left)
         transport = self._open_transport()
         small = delivery is Delivery.NEWEST and not self._on_this_machine
         warn_of_baseline(rig)
@@ -203,6 +222,8 @@ class DepthClient:
                 threads=self._threads,
                 on_event=on_event,
                 rules=RecoveryRules(on_lost, open_timeout_s),
+                clock=CaptureClock(clock, live=delivery is Delivery.NEWEST),
+                poses=PoseBuffer(tracked_from_left, pose_offset_s),
             )
         )
         self._sessions.add(session)

@@ -7,11 +7,11 @@ import math
 from dataclasses import replace
 from typing import TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vergence_proto.errors import BadShape
+from vergence_proto.opencv import cv2
 from vergence_proto.types import DisparityMap
 
 Result = TypeVar("Result", bound=DisparityMap)

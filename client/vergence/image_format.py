@@ -4,12 +4,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vergence_proto import codec
 from vergence_proto.errors import BadShape
+from vergence_proto.opencv import cv2
 from vergence_proto.types import ImageEncoding, StereoFrame
 
 CameraImage = NDArray[np.uint8] | bytes | bytearray | memoryview

@@ -1,6 +1,6 @@
 """The public names of ``vergence``, and where each is defined."""
 
-from vergence.blocking import BlockingClient, BlockingSession, depth
+from vergence.blocking import BlockingClient, BlockingSession
 from vergence.client import DepthClient
 from vergence.errors import NotOpen, WrongDelivery
 from vergence.filters import keep_confident, keep_range, without_speckles
@@ -10,6 +10,7 @@ from vergence.jobs.client import AsyncBatchClient, AsyncBatchJob
 from vergence.jobs.frames import BatchFrame
 from vergence.jobs.info import JobInfo
 from vergence.link import LinkState
+from vergence.one_pair import depth
 from vergence.reprojection import DepthView, View, reproject
 from vergence.results import (
     DepthResult,

@@ -1,6 +1,7 @@
 """The latest results of a session, for readers in any thread."""
 
 import time
+from collections.abc import Callable
 
 from vergence.reprojection import DepthView, Fill, View, reproject
 from vergence.results import DepthResult
@@ -17,7 +18,8 @@ class RecentResults:
     One thread adds; any thread reads without waiting, because each change replaces one reference.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        self._now_ns = now_ns  # the clock of captures
         self.kept: tuple[DepthResult, ...] = ()  # the newest first
 
     @property
@@ -49,7 +51,7 @@ class RecentResults:
     ) -> DepthView | None:
         """Show the newest result from another pose; None if there is none of at most that age."""
         kept = self.kept  # one read: another thread may replace it
-        at_ns = time.monotonic_ns() if at_ns is None else at_ns
+        at_ns = self._now_ns() if at_ns is None else at_ns
         if not kept or at_ns - kept[0].capture_ns > max_age_s * 1e9:
             return None
         latest, *older = kept

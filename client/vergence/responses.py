@@ -8,7 +8,7 @@ from dataclasses import fields
 from functools import partial
 from typing import TypeVar
 
-from vergence.capture_clock import age_of
+from vergence.capture_clock import CaptureClock
 from vergence.connection import RESET, FrameRequest, Request
 from vergence.in_flight import FrameInFlight, FramesInFlight
 from vergence.recent import RecentResults
@@ -33,10 +33,17 @@ class ResponseRouter:
     rig: RectifiedRig
 
     def __init__(
-        self, in_flight: FramesInFlight, axes: Axes, threads: Executor, *, paces: bool = False
+        self,
+        in_flight: FramesInFlight,
+        axes: Axes,
+        threads: Executor,
+        clock: CaptureClock,
+        *,
+        paces: bool = False,
     ) -> None:
+        self._clock = clock
         self._paces = paces  # the session paces its frames, so its credit is larger
-        self.recent: RecentResults = RecentResults()
+        self.recent: RecentResults = RecentResults(clock.now_ns)
         self.opened: pb.StreamOpened | None = None  # None: the stream was never open
         self.error: Exception | None = None  # the error that ended the stream
         self.reset_after: int | None = None  # the last frame before a reset not yet confirmed
@@ -124,7 +131,7 @@ class ResponseRouter:
                     self._dropped(frame_id)
 
     async def _map(self, message: pb.DisparityMap) -> None:
-        age_s = age_of(message.capture_ns)
+        age_s = self._clock.age_s(message.capture_ns)
         if self.reset_after is not None and message.frame_id > self.reset_after:
             self.reset_after = None
         work = partial(_decoded, message, self.rig)

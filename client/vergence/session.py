@@ -5,7 +5,6 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import Self
 
-from vergence.capture_clock import CaptureClock
 from vergence.connection import RESET
 from vergence.errors import NotOpen, WrongDelivery
 from vergence.image_format import CameraImage, frame_request, sent_image
@@ -13,7 +12,8 @@ from vergence.in_flight import FrameInFlight
 from vergence.results import DepthResult, NotSent, SessionState
 from vergence.session_facts import SessionFacts, SessionParts, SessionSetup
 from vergence_proto.geometry import Matrix, Pose
-from vergence_proto.types import Delivery, PoseSample, StereoFrame
+from vergence_proto.opencv import load_opencv
+from vergence_proto.types import Delivery, ImageEncoding, PoseSample, StereoFrame
 
 WorldFromLeft = Pose | PoseSample | Matrix | Sequence[Sequence[float]] | None
 
@@ -55,7 +55,6 @@ class DepthSession(SessionFacts):
 
     def __init__(self, setup: SessionSetup, /) -> None:
         super().__init__(SessionParts.of(setup))
-        self._clock = CaptureClock(live=setup.delivery is Delivery.NEWEST)
         self._turn = asyncio.Lock()
         self._next_id = 1
 
@@ -90,6 +89,9 @@ class DepthSession(SessionFacts):
         """
         if self._parts.responses.opened is not None:
             raise NotOpen("this session was opened before; make a new one with open_session()")
+        link = self._parts.setup.link
+        if link.images.encoding is not ImageEncoding.RAW or link.map_step > 1:
+            self._parts.setup.threads.submit(load_opencv)  # the first frame does not wait for it
         await self._parts.connection.open()
         self._left_open = True
         self._next_id = self._parts.opened().last_frame_id + 1
@@ -129,10 +131,11 @@ class DepthSession(SessionFacts):
             uint8 [H, W] grey, [H, W, 3] RGB, [H, W, 4] RGBA or [H * 3/2, W] NV12, of the rig's
             size; or the bytes of a JPEG or PNG file, which travel as they are.
         world_from_left
-            The left camera's pose at mid-exposure; None: not known.
+            The left camera's pose at mid-exposure; None: interpolated, if poses were given to
+            :meth:`track`, else not known.
         capture_ns
-            ``time.monotonic_ns()`` at mid-exposure; default: now. Another clock in nanoseconds
-            will do; then the ages of results are NaN.
+            ``time.monotonic_ns()`` at mid-exposure, or the time of the session's ``clock``;
+            default: now. Another clock in nanoseconds will do; then the ages of results are NaN.
         max_age_s
             A frame that waits in the server for longer is dropped (``drops.stale``).
 
@@ -146,9 +149,10 @@ class DepthSession(SessionFacts):
         BadImage
             An image has another type or shape, or is a damaged file.
         BadPose
-            The pose is not finite, or its rotation is not orthonormal with determinant +1.
+            The pose is not finite, or its rotation is not orthonormal with determinant +1; or the
+            frame is outside the tracked poses.
         BadShape
-            ``capture_ns`` is no whole number of 64 bits.
+            ``capture_ns`` is no whole number of 64 bits, or impossible on the session's ``clock``.
         WrongDelivery
             The session's delivery is EVERY, which must not drop frames; use :meth:`step`.
         NotOpen
@@ -287,8 +291,11 @@ class DepthSession(SessionFacts):
             world_from_left = Pose.from_matrix(world_from_left)
         if isinstance(world_from_left, Pose):
             world_from_left = PoseSample(world_from_left)
-        capture_ns = self._clock.checked_ns(capture_ns)
-        camera, link = self._parts.setup.opening.rig.left, self._parts.link
+        setup = self._parts.setup
+        capture_ns = setup.clock.checked_ns(capture_ns)
+        if world_from_left is None and setup.poses.in_use:
+            world_from_left = setup.poses.at(capture_ns)
+        camera, link = setup.opening.rig.left, self._parts.link
         size = (camera.width, camera.height)
         frame = StereoFrame(
             self._next_id,

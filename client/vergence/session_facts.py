@@ -11,12 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vergence.attaching import RecoveryRules
+from vergence.capture_clock import CaptureClock
 from vergence.connection import StreamConnection
 from vergence.errors import NotOpen
 from vergence.in_flight import FramesInFlight
 from vergence.info import ModelInfo
 from vergence.info_codec import model_info_from_proto
 from vergence.link import LinkRules, LinkState, SessionLink
+from vergence.pose_buffer import PoseBuffer
 from vergence.raw_pixels import image_pixels
 from vergence.recording import SessionRecording
 from vergence.reprojection import DepthView, Fill, View
@@ -40,6 +42,8 @@ class SessionSetup:
     threads: Executor  # for work on whole images
     on_event: Callable[[SessionEvent], None] | None
     rules: RecoveryRules
+    clock: CaptureClock
+    poses: PoseBuffer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +60,9 @@ class SessionParts:
     def of(cls, setup: SessionSetup) -> Self:
         in_flight = FramesInFlight()
         axes = codec.axes_from_proto(setup.opening.axes)
-        responses = ResponseRouter(in_flight, axes, setup.threads, paces=setup.link.adapts)
+        responses = ResponseRouter(
+            in_flight, axes, setup.threads, setup.clock, paces=setup.link.adapts
+        )
         link = SessionLink(setup.link)
         connection = StreamConnection(
             setup.transport, setup.opening, responses, setup.on_event, setup.rules, link
@@ -145,6 +151,32 @@ class SessionFacts:
     def round_trip_s(self) -> float | None:
         """Network time in seconds, there and back, of the latest ping; None before the first."""
         return self._parts.connection.round_trip_s
+
+    def track(self, t_ns: int, world_from_tracked: Pose | PoseSample | Matrix) -> None:
+        """Add a pose of the tracker; frames without a pose then get one, interpolated.
+
+        Any thread may call it, at the tracker's own rate. A frame that is submitted without a pose
+        has that of ``capture_ns + pose_offset_s``, times ``tracked_from_left`` (both of
+        ``open_session``). Poses must be tracked before the frames between them are submitted.
+
+        Parameters
+        ----------
+        t_ns
+            The time of the pose in nanoseconds, on the clock of ``capture_ns``; it ascends.
+        world_from_tracked
+            The pose of the tracked body, in the session's axes and metres; a matrix is [3, 4] or
+            [4, 4].
+
+        Raises
+        ------
+        BadPose
+            The pose is not finite or no rigid transform, or its time is not after the latest.
+        """
+        if not isinstance(world_from_tracked, (Pose, PoseSample)):
+            world_from_tracked = Pose.from_matrix(world_from_tracked)
+        if isinstance(world_from_tracked, Pose):
+            world_from_tracked = PoseSample(world_from_tracked)
+        self._parts.setup.poses.add(t_ns, world_from_tracked)
 
     @property
     def link(self) -> LinkState:

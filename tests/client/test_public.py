@@ -53,4 +53,5 @@ def test_the_import_is_light() -> None:
     ).stdout.split()
     assert "vergence" in loaded
     assert not HEAVY & set(loaded)
+    assert "cv2" not in loaded  # it is loaded with the first image that is encoded
     assert not {"vergence_service", "vergence_models"} & set(loaded)

@@ -106,7 +106,8 @@ async def _serve(record: str, host: str, flags: dict[str, str]) -> None:
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     with tempfile.TemporaryDirectory() as jobs:
         settings = load_settings(
-            flags={"server.host": host, "batch.directory": jobs, "grpc.port": 0, "http.port": 0}
+            flags={"server.host": host, "security.insecure": True, "batch.directory": jobs}
+            | {"grpc.port": 0, "http.port": 0}
             | flags
         )
         model = RecallModel() if record == "recall" else RecordedModel(Path(record))

@@ -8,20 +8,18 @@ module calls OpenCV's decoders.
 
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vergence_proto.codec.image_files import ImageFile, ImageKind, read_image_file
 from vergence_proto.codec.wire import Piece, delimited
 from vergence_proto.errors import BadImage
+from vergence_proto.opencv import cv2
 from vergence_proto.types import Image, ImageEncoding
 from vergence_proto.v1 import depth_pb2 as pb
 
 _CHANNELS = {pb.IMAGE_ENCODING_MONO8: 1, pb.IMAGE_ENCODING_RGB8: 3}
 
-# The rig describes the rows as they are stored, so a hint to viewers to rotate them is ignored.
-_AS_COLOUR = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 _OUT_OF_MEMORY = -4  # cv::Error::StsNoMem
 
 _FILE_KINDS = {
@@ -105,7 +103,7 @@ def image_from_proto(message: pb.Image, data: Piece | None = None) -> Image:
             f"the message says {stated[0]}x{stated[1]}, its {kind.value} is "
             f"{file.width}x{file.height}"
         )
-    return _as_rgb(_decoded(file, _AS_COLOUR))
+    return _as_rgb(_decoded(file, _as_colour()))
 
 
 def decode_image(data: Piece) -> Image:
@@ -113,7 +111,7 @@ def decode_image(data: Piece) -> Image:
 
     Raises BadImage: the bytes are no image file, or one that is cut short or damaged.
     """
-    return _as_rgb(_decoded(read_image_file(data), _AS_COLOUR))
+    return _as_rgb(_decoded(read_image_file(data), _as_colour()))
 
 
 def decode_stored(data: Piece) -> NDArray[Any]:
@@ -122,6 +120,11 @@ def decode_stored(data: Piece) -> NDArray[Any]:
     Raises BadImage: the bytes are no image file, or one that is cut short or damaged.
     """
     return _decoded(read_image_file(data), cv2.IMREAD_UNCHANGED)
+
+
+def _as_colour() -> int:
+    # The rig describes the rows as they are stored, so a hint to viewers to rotate them is ignored.
+    return cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
 
 def _decoded(file: ImageFile, flags: int) -> NDArray[Any]:

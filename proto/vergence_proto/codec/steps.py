@@ -1,10 +1,10 @@
 """Small maps and images: every n-th row and column of a map, and images of half the size."""
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vergence_proto.errors import BadShape
+from vergence_proto.opencv import cv2
 from vergence_proto.types import Plane
 
 MAP_STEPS = (1, 2, 4)
