@@ -17,12 +17,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vergence_proto.datasets import encode_disparity_png, encode_pfm
 from vergence_proto.jobs import Output, ResultFormat
+from vergence_proto.opencv import cv2
 from vergence_proto.types import Plane
 
 _MM_PER_M = np.float32(1000)

@@ -16,13 +16,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import cv2
 import numpy as np
 
-from vergence_proto.datasets import DATASETS, DatasetError, find_sources
-from vergence_proto.datasets.listing import found
 from vergence_proto.errors import BadSequence
 from vergence_proto.geometry import Pose, RectifiedRig
+from vergence_proto.opencv import cv2
 
 ARCHIVES = (".zip", ".tar", ".tar.gz", ".tgz", ".tar.xz", ".txz", ".tar.bz2", ".tbz2")
 _CHUNK = 1 << 20
@@ -76,6 +74,8 @@ class Upload:
             yield _END[max(start - at, 0) :]
 
     def _members(self) -> Iterator[tuple[bytes, Path, int]]:
+        from vergence_proto.datasets.listing import found
+
         for path in found(self.path, "*"):
             if path.is_file():
                 info = tarfile.TarInfo(path.relative_to(self.path).as_posix())
@@ -85,6 +85,9 @@ class Upload:
 
 def find_upload(source: str | Path) -> Upload:
     """Find what a path or ``KIND:PATH`` means. Raises BadSequence: nothing, or more than one."""
+    # Here, because the readers take as long to load as the rest of the client.
+    from vergence_proto.datasets import DATASETS
+
     kind, colon, rest = str(source).partition(":")
     if colon and kind in DATASETS:
         return Upload(Path(rest.partition("?")[0]), f"{kind}:{_options(rest)}")
@@ -103,6 +106,8 @@ def find_upload(source: str | Path) -> Upload:
 
 
 def _sequences_in(path: Path) -> Iterator[Upload]:
+    from vergence_proto.datasets import DATASETS, DatasetError, find_sources
+
     try:
         own = [Path(spec.partition(":")[2]) for spec in find_sources(f"{_OWN}:{path}")]
         if own:

@@ -3,13 +3,14 @@
 import json
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vergence_proto.errors import BadShape
 from vergence_proto.job_results.frame_file import JobFrame
-from vergence_proto.job_results.layouts import LAYOUTS, File
-from vergence_proto.job_results.manifest import about_of
 from vergence_proto.jobs import ResultFormat
+
+if TYPE_CHECKING:
+    from vergence_proto.job_results.layouts import File
 
 MANIFEST = "manifest.json"
 _RIG = "rig.json"
@@ -23,6 +24,9 @@ _OWN_SUFFIXES |= {".jsonl"}
 
 def checked_format(form: str) -> ResultFormat:
     """Return the format. Raises BadShape: there is no such format of folders."""
+    # Here, because the layouts take as long to load as the rest of the client.
+    from vergence_proto.job_results.layouts import LAYOUTS
+
     known = [each.value for each in LAYOUTS]
     if form not in known:
         raise BadShape(f"expected a format of {', '.join(known)}, got {form!r}")
@@ -87,6 +91,10 @@ class Saving:
     """
 
     def __init__(self, folder: Path, form: str, manifest: Mapping[str, Any]) -> None:
+        from vergence_proto.job_results.layouts import LAYOUTS
+        from vergence_proto.job_results.manifest import about_of
+
+        self._about_of = about_of
         self._folder = folder
         self._form = checked_format(form)
         stated = {**manifest, "format": self._form.value, "state": "incomplete"}
@@ -99,10 +107,10 @@ class Saving:
 
     def end(self, manifest: Mapping[str, Any]) -> None:
         """Write the last files; ``manifest`` is that of the ended job."""
-        self._layout.about = about_of({**manifest, "format": self._form.value})
+        self._layout.about = self._about_of({**manifest, "format": self._form.value})
         self._write(self._layout.end())
 
-    def _write(self, files: Iterator[File]) -> None:
+    def _write(self, files: "Iterator[File]") -> None:
         for file in files:
             path = self._folder / file.name
             path.parent.mkdir(parents=True, exist_ok=True)

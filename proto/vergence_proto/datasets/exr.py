@@ -11,10 +11,10 @@ import zlib
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from vergence_proto.datasets.files import DatasetError, existing
+from vergence_proto.opencv import cv2
 from vergence_proto.types import Plane
 
 _MAGIC = b"\x76\x2f\x31\x01"

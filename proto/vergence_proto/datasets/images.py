@@ -4,13 +4,13 @@ import re
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vergence_proto.codec.images import decode_image, decode_stored
 from vergence_proto.datasets.files import DatasetError, existing
 from vergence_proto.errors import BadImage
+from vergence_proto.opencv import cv2
 from vergence_proto.types import Image, Plane
 
 # KITTI's development kit: stored = disparity * 256; 0 means no value.

@@ -4,12 +4,12 @@ import bisect
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from vergence_proto.datasets.files import DatasetError, numbers, read_lines
 from vergence_proto.errors import BadPose
 from vergence_proto.geometry import Matrix, Pose
+from vergence_proto.opencv import cv2
 
 _UNIT_TOLERANCE = 1e-2
 # Over a longer gap, a head or a drone may not move in a straight line.

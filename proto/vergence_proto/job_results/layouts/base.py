@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
-import cv2
 import numpy as np
 
 from vergence_proto.codec.image_files import ImageKind, image_kind
@@ -17,6 +16,7 @@ from vergence_proto.geometry import RectifiedRig
 from vergence_proto.job_results.frame_file import JobFrame
 from vergence_proto.job_results.records import FrameRecord
 from vergence_proto.jobs import JobOutput
+from vergence_proto.opencv import cv2
 
 _SUFFIXES = {
     ImageKind.PNG: ".png",

@@ -6,12 +6,12 @@ Source: https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats. evo read
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
-import cv2
 import numpy as np
 
 from vergence_proto.job_results.frame_file import JobFrame
 from vergence_proto.job_results.layouts.base import About, File, Layout, left_png, numbers
 from vergence_proto.jobs import JobOutput
+from vergence_proto.opencv import cv2
 from vergence_proto.types import Plane
 
 _STEPS_PER_M = np.float32(5000)
