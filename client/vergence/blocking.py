@@ -26,7 +26,7 @@ class BlockingSession(SessionFacts):
     """A :class:`DepthSession` whose ``step`` returns and whose iteration is ``for``.
 
     :meth:`BlockingClient.open_session` makes it; use it inside ``with``. Every method but
-    ``__enter__`` raises :class:`NotOpen` before that.
+    ``__enter__`` raises :class:`vergence.NotOpen` before that.
     """
 
     def __init__(self, session: DepthSession, loop: LoopThread, /) -> None:
@@ -172,8 +172,8 @@ class BlockingSession(SessionFacts):
 class BlockingClient:
     """A :class:`DepthClient` with its own event loop, for use inside ``with``.
 
-    ``on_event`` callbacks run in the loop's thread. Every method raises :class:`NotOpen` outside
-    ``with``.
+    ``on_event`` callbacks run in the loop's thread. Outside ``with``, every method raises
+    :class:`vergence.NotOpen`.
 
     Parameters
     ----------

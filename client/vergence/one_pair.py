@@ -26,7 +26,7 @@ def depth(
     rig
         The cameras as they are; the server rectifies the images if the rig is not rectified.
     server
-        The address of the server, as in :class:`DepthClient`.
+        The address of the server, as in :class:`vergence.DepthClient`.
     iterations
         Refinement iterations; 0: the server's default for a cold start.
 

@@ -46,7 +46,7 @@ class AsyncBatchClient:
     server
         ``http://HOST:PORT`` or ``https://HOST:PORT``.
     token, ca, cert, key
-        Credentials, as those of :class:`DepthClient`.
+        Credentials, as those of :class:`vergence.DepthClient`.
     patience_s
         Give up when no byte has come or gone for this long.
 
