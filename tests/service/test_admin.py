@@ -54,8 +54,10 @@ async def test_without_tokens_it_is_for_this_machine_and_for_no_foreign_page() -
         assert closing.status_code == 401
         base = f"http://{server.http_address}"
         async with httpx.AsyncClient(base_url=base) as public:
-            for path in ("/metrics", "/v1/admin/streams", "/docs"):
+            for path in ("/v1/admin/streams", "/docs"):
                 assert (await public.get(path)).status_code == 404
+            # Only this machine can ask, and there is nobody to hide the metrics from.
+            assert "vergence_streams_open 0.0" in (await public.get("/metrics")).text
 
 
 async def test_with_tokens_it_is_for_administrators(tmp_path: Path) -> None:
@@ -72,6 +74,10 @@ async def test_with_tokens_it_is_for_administrators(tmp_path: Path) -> None:
             assert (await ana.get(path)).status_code == 403
             assert (await root.get(path)).status_code == 200
         assert (await stranger.get("/healthz")).status_code == 200
+        async with httpx.AsyncClient(
+            base_url=f"http://{server.http_address}", headers=file.shown("root")
+        ) as public:
+            assert (await public.get("/metrics")).status_code == 404
         call = RawCall(calls.StreamDepth(metadata=tuple(file.shown("ana").items())))
         await call.ask(open_message("hers"))
         assert (await ana.delete("/v1/admin/streams/ana/hers")).status_code == 403

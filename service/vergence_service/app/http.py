@@ -11,8 +11,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from prometheus_client import CollectorRegistry
+
 from vergence_service.access.gate import Gate
-from vergence_service.app.security import host_names
+from vergence_service.app.security import host_names, is_loopback
 from vergence_service.jobs.archives import ArchiveLimits
 from vergence_service.jobs.places import Places
 from vergence_service.jobs.queue import JobQueue, QueueLimits
@@ -23,6 +25,7 @@ from vergence_service.transports.addresses import listening_socket
 from vergence_service.transports.http.app import HttpServer, make_http_app
 from vergence_service.transports.http.border import Border
 from vergence_service.transports.http.connections import ConnectionLimits
+from vergence_service.transports.http.metrics import metrics_routes
 from vergence_service.transports.http.pairs import pair_routes
 from vergence_service.transports.http.sequences import no_sequence_routes, sequence_routes
 from vergence_service.transports.http.streams import stream_routes
@@ -58,8 +61,11 @@ async def serving_http(
     connections: int,
     gate: Gate,
     certificate: Certificate | None,
+    registry: CollectorRegistry,
 ) -> AsyncIterator[HttpTransport]:
     """Serve HTTP until the end of the block.
+
+    The metrics of ``registry`` are served here too if only this machine can reach the server.
 
     Raises PortTaken if the server cannot listen on ``host``.
     """
@@ -101,6 +107,8 @@ async def serving_http(
                 min_bytes_per_s=min_bytes_per_s,
             ),
         ]
+        if gate.open and is_loopback(host):
+            routes.append(metrics_routes(registry))
         queue: JobQueue | None = None
         try:
             store = stack.enter_context(_job_store(settings))

@@ -178,6 +178,7 @@ async def running(
             connections=connections,
             gate=gate,
             certificate=certificate,
+            registry=registry,
         ) as http,
         serving_zenoh(settings, unary, open_calls("zenoh"), gate) as zenoh,
         serving_admin(

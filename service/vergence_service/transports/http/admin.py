@@ -10,7 +10,7 @@ from urllib.parse import parse_qs
 
 from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
-from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
+from prometheus_client import CollectorRegistry
 
 from vergence_proto.errors import DepthError, Unauthenticated
 from vergence_service.access.gate import Gate
@@ -18,6 +18,7 @@ from vergence_service.access.principals import Principal, Role
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.report import StreamReport, reports
 from vergence_service.transports.http.errors import PROBLEM_RESPONSE, install_problems
+from vergence_service.transports.http.metrics import metrics_routes
 
 COOKIE = "vergence_admin"
 LOGIN = "/login"
@@ -85,17 +86,13 @@ def make_admin_app(
     """Make the application. ``public_schema`` is that of the HTTP API; ``secure``: over TLS."""
     app = FastAPI(title="Vergence, administration", docs_url=None, redoc_url=None)
     install_problems(app)
+    app.include_router(metrics_routes(registry))
     router = APIRouter(responses=PROBLEM_RESPONSE)
 
     @router.get("/healthz")
     async def alive() -> dict[str, str]:
         """Check that the process answers."""
         return {"status": "alive"}
-
-    @router.get("/metrics", response_class=Response)
-    async def metrics() -> Response:
-        """Get the metrics, in the format of Prometheus."""
-        return Response(generate_latest(registry), media_type=CONTENT_TYPE_LATEST)
 
     @router.get("/v1/admin/streams")
     async def streams() -> list[StreamReport]:
