@@ -21,6 +21,7 @@ from tests.support.http import (
     is_known,
     metrics_of,
     reason_of,
+    state_of,
     submit,
 )
 from tests.support.models import RAISES, RecallModel
@@ -146,3 +147,19 @@ async def test_a_second_server_on_the_same_folder_serves_live_and_says_why_not_m
         assert "batch.directory" in answer.text
         async with raw_stream(server) as call:
             assert (await call.ask(frame_message(make_frame(1)))).disparity.frame_id == 1
+
+
+async def test_as_many_jobs_are_stepped_as_the_model_has_lanes() -> None:
+    model = RecallModel(max_concurrent_steps=2)
+    async with http_server(model) as client:
+        with model.busy():
+            jobs = [await submit(client, ARCHIVE) for _ in range(3)]
+            for _ in range(2):
+                await asyncio.to_thread(model.wait_until_entered)
+            states = [await state_of(client, job["id"]) for job in jobs]
+        done = [await ended(client, job["id"]) for job in jobs]
+        maps = [await disparities(client, job["id"]) for job in jobs]
+    assert states == ["running", "running", "queued"]
+    assert [job["state"] for job in done] == ["done"] * 3
+    np.testing.assert_array_equal(maps[0], maps[1])
+    np.testing.assert_array_equal(maps[0], maps[2])

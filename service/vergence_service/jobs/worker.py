@@ -3,7 +3,7 @@
 import asyncio
 import logging
 import time
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 
 from vergence_proto.errors import (
@@ -33,6 +33,7 @@ log = logging.getLogger(__name__)
 _MAX_ATTEMPTS = 4
 _EXPIRE_EVERY_S = 30.0
 _LEAST_EXPIRE_S = 0.05
+_LOOK_EVERY_S = 5.0  # whether live streams have come or gone
 # Pause before trying again when the disk refused to read or write.
 _TROUBLE_PAUSE_S = 1.0
 
@@ -43,17 +44,18 @@ class _Run:
 
     progress: JobProgress
     task: asyncio.Task[None] | None = None
-    stepped: asyncio.Event = field(default_factory=asyncio.Event)  # set when the model is free
+    stepped: bool = False  # the model is free, and the result is being finished
 
 
 class JobWorker:
-    """Steps one job at a time, so that every sequence is done as early as possible."""
+    """Steps the oldest jobs: as many as the model has lanes, or one beside live streams."""
 
     def __init__(self, engine: DepthEngine, jobs: JobRegistry, *, checkpoint_s: float) -> None:
         self._engine = engine
         self._jobs = jobs
         self._checkpoint_s = checkpoint_s
-        self._runs: dict[str, _Run] = {}  # at most two: one is stepped, one is finished
+        self._runs: dict[str, _Run] = {}
+        self._freed = asyncio.Event()  # a run has left the model, or has ended
         self._leaving = False  # the server is shutting down
         self._tasks: list[asyncio.Task[None]] = []
         self._metrics = engine.metrics
@@ -86,21 +88,40 @@ class JobWorker:
 
     async def _run_all(self) -> None:
         async with asyncio.TaskGroup() as tasks:
-            before: asyncio.Task[None] | None = None
             while not self._leaving:
-                waiting = self._jobs.unfinished()
-                job = next((each for each in waiting if each.job_id not in self._runs), None)
+                self._freed.clear()
+                job = self._next()
                 if job is None:
-                    await self._jobs.change(within_s=_EXPIRE_EVERY_S)
+                    await self._change()
                     continue
                 run = self._runs[job.job_id] = _Run(self._jobs.begin_run(job.job_id))
                 run.task = tasks.create_task(self._run(job, run), name=f"sequence {job.job_id}")
-                # The next job is stepped while this one is finished, for disks can be slow. A third
-                # one has to wait.
-                await run.stepped.wait()
-                if before is not None:
-                    await asyncio.wait([before])
-                before = run.task
+
+    def _next(self) -> Job | None:
+        """Return the job to run now, the oldest that waits, or None if none may run."""
+        stepping = sum(not run.stepped for run in self._runs.values())
+        # A job is stepped while the one before it is finished, for disks can be slow. More than
+        # one that is being finished keep others waiting.
+        finishing = len(self._runs) - stepping
+        # Steps of one job follow each other, so it leaves cores idle that another job can use. The
+        # last lane is for live streams.
+        live = bool(self._engine.streams.attachments())
+        if stepping >= (1 if live else self._engine.lanes) or finishing > 1:
+            return None
+        waiting = self._jobs.unfinished()
+        return next((each for each in waiting if each.job_id not in self._runs), None)
+
+    async def _change(self) -> None:
+        """Wait until another job may run, as far as that shows; look again in any case."""
+        waits = [
+            asyncio.create_task(self._freed.wait()),
+            asyncio.create_task(self._jobs.change(within_s=_LOOK_EVERY_S)),
+        ]
+        try:
+            await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for wait in waits:
+                wait.cancel()
 
     async def _run(self, job: Job, run: _Run) -> None:
         try:
@@ -108,7 +129,8 @@ class JobWorker:
                 ended = await self._stepped(job, run.progress)
             finally:
                 self._jobs.end_stepping(job.job_id)
-                run.stepped.set()
+                run.stepped = True
+                self._freed.set()
             if ended is not None:
                 # Clients must not see the end of the job before the metrics do.
                 counted = partial(self._count_ended, ended, run.progress)
@@ -119,6 +141,7 @@ class JobWorker:
             await self._wait_out(job, error)
         finally:
             del self._runs[job.job_id]
+            self._freed.set()
             self._jobs.end_run(job.job_id)
 
     async def _wait_out(self, job: Job, error: Exception) -> None:

@@ -100,6 +100,11 @@ class DepthEngine:
         return self._model.engine
 
     @property
+    def lanes(self) -> int:
+        """The number of steps that the model can take side by side."""
+        return self._model.max_concurrent_steps
+
+    @property
     def provider(self) -> str:
         """The execution provider of the model."""
         return self._model.provider
