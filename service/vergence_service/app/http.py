@@ -25,6 +25,7 @@ from vergence_service.transports.addresses import listening_socket
 from vergence_service.transports.http.app import HttpServer, make_http_app
 from vergence_service.transports.http.border import Border
 from vergence_service.transports.http.connections import ConnectionLimits
+from vergence_service.transports.http.inference_protocol import inference_routes
 from vergence_service.transports.http.metrics import metrics_routes
 from vergence_service.transports.http.pairs import pair_routes
 from vergence_service.transports.http.sequences import no_sequence_routes, sequence_routes
@@ -100,6 +101,7 @@ async def serving_http(
         )
         routes = [
             pair_routes(engine, places, limits=pair),
+            inference_routes(engine, places, limits=pair),
             stream_routes(
                 calls,
                 unary,

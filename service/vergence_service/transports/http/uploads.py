@@ -153,7 +153,7 @@ async def receive_sequence(
     elif kind in ARCHIVE_TYPES:
         archive = folder / "archive"
         with archive.open("wb") as file:
-            async for chunk in _chunks(request, limits):
+            async for chunk in body_chunks(request, limits):
                 await threads.run(_write, file, chunk, digest)
         async with while_connected(request):
             await threads.finish(_unpacking(archive, folder, limits))
@@ -167,7 +167,7 @@ async def receive_sequence(
 async def digest_of(request: Request, limits: UploadLimits, threads: ThreadPool) -> str:
     """Receive a body without keeping it; return its SHA-256. Raises what receiving it raises."""
     digest = hashlib.sha256()
-    async for chunk in _chunks(request, limits):
+    async for chunk in body_chunks(request, limits):
         await threads.run(digest.update, chunk)
     return digest.hexdigest()
 
@@ -193,7 +193,7 @@ async def receive_form(
     await threads.run(parts.mkdir)
     writer = FormWriter(request.headers["content-type"], parts, max_parts=limits.archive.max_files)
     try:
-        async for chunk in _chunks(request, limits):
+        async for chunk in body_chunks(request, limits):
             await threads.run(writer.write, chunk)
             if digest is not None:
                 await threads.run(digest.update, chunk)
@@ -202,7 +202,8 @@ async def receive_form(
         writer.close()
 
 
-async def _chunks(request: Request, limits: UploadLimits) -> AsyncIterator[bytes]:
+async def body_chunks(request: Request, limits: UploadLimits) -> AsyncIterator[bytes]:
+    """Yield a body as it arrives. Raises UploadTooLarge, ClientTimeout and BadSequence."""
     too_large = UploadTooLarge(
         f"expected an upload of at most {limits.max_bytes} bytes; the server's setting "
         f"{limits.max_bytes_setting} allows more"

@@ -1,0 +1,272 @@
+"""Single pairs by the Open Inference Protocol v2, as inference servers speak it over HTTP.
+
+Its clients and its tools for measuring work as they are. A pair is two tensors, ``left`` and
+``right``, uint8 [1, H, W, 3]; the answer is ``disparity`` and ``sigma``, float32 [1, H, W]. Streams
+and everything that they remember stay with the protocol of this project.
+"""
+
+import json
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version as installed_version
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from fastapi import APIRouter, Request, Response
+from fastapi import Path as PathParameter
+from fastapi.responses import JSONResponse
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from vergence_proto.errors import BadShape, DepthError, FrameTooLarge, UploadTooLarge
+from vergence_proto.geometry import RectifiedRig
+from vergence_proto.types import (
+    Delivery,
+    DisparityMap,
+    Image,
+    OutputFormat,
+    StereoFrame,
+    StereoRig,
+)
+from vergence_service.jobs.places import Places
+from vergence_service.streams.engine import DepthEngine
+from vergence_service.streams.stream import StreamConfig
+from vergence_service.transports.http.errors import HTTP_STATUS
+from vergence_service.transports.http.uploads import UploadLimits, body_chunks, while_connected
+
+JSON_LENGTH = "Inference-Header-Content-Length"  # bytes of JSON before the binary tensors
+_INPUTS = ("left", "right")
+_OUTPUTS = ("disparity", "sigma")
+_LARGEST_JSON = 8 << 20  # its numbers take a dozen times the memory
+_VERSION = "1"
+
+
+class _Parameters(BaseModel):
+    """Those of the extension for binary tensors; others are ignored, as the protocol asks."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    binary_data_size: int | None = Field(default=None, ge=0)
+    binary_data: bool = False
+    binary_data_output: bool = False
+
+
+class _Input(BaseModel):
+    name: Literal["left", "right"]
+    shape: Annotated[list[int], Field(min_length=4, max_length=4)]
+    datatype: Literal["UINT8"]
+    parameters: _Parameters = _Parameters()
+    data: list[Any] | None = None
+
+
+class _Output(BaseModel):
+    name: Literal["disparity", "sigma"]
+    parameters: _Parameters = _Parameters()
+
+
+class _InferRequest(BaseModel):
+    model_config = ConfigDict(extra="ignore")
+
+    id: Annotated[str, Field(max_length=200)] = ""
+    parameters: _Parameters = _Parameters()
+    inputs: Annotated[list[_Input], Field(min_length=2, max_length=2)]
+    outputs: Annotated[list[_Output], Field(max_length=2)] = []
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pair:
+    request: _InferRequest
+    left: Image
+    right: Image
+
+
+def inference_routes(engine: DepthEngine, places: Places, *, limits: UploadLimits) -> APIRouter:
+    """Make the routes below /v2. Pairs share the ``places`` of /v1/pairs."""
+    # The protocol has a schema of its own, and errors of its own.
+    router = APIRouter(include_in_schema=False)
+    name = engine.card.name
+    model_paths = ("/v2/models/{model}", f"/v2/models/{{model}}/versions/{_VERSION}")
+
+    @router.get("/v2")
+    async def server() -> dict[str, Any]:
+        version = installed_version("vergence")
+        return {"name": "vergence", "version": version, "extensions": ["binary_tensor_data"]}
+
+    @router.get("/v2/health/live")
+    async def live() -> Response:
+        return Response()
+
+    @router.get("/v2/health/ready")
+    async def ready() -> Response:
+        return Response(status_code=200 if engine.ready else 503)
+
+    async def model_ready(model: Annotated[str, PathParameter()]) -> Response:
+        if model != name:
+            return _unknown(model, name)
+        return Response(status_code=200 if engine.ready else 503)
+
+    async def model_metadata(model: Annotated[str, PathParameter()]) -> Response:
+        return JSONResponse(_metadata(engine)) if model == name else _unknown(model, name)
+
+    async def infer(model: Annotated[str, PathParameter()], request: Request) -> Response:
+        if model != name:
+            return _unknown(model, name)
+        try:
+            places.check()  # before the upload, which would be for nothing
+            with tempfile.TemporaryDirectory() as scratch:
+                body = Path(scratch) / "body"
+                with body.open("wb") as file:
+                    async for chunk in body_chunks(request, limits):
+                        await engine.threads.background.run(file.write, chunk)
+                async with while_connected(request), places.taken():
+                    length = request.headers.get(JSON_LENGTH)
+                    return await _inferred(engine, body, length)
+        except DepthError as error:
+            return _error(error)
+
+    for path in model_paths:
+        router.add_api_route(path, model_metadata, methods=["GET"], response_model=None)
+        router.add_api_route(f"{path}/ready", model_ready, methods=["GET"], response_model=None)
+        router.add_api_route(f"{path}/infer", infer, methods=["POST"], response_model=None)
+    return router
+
+
+async def _inferred(engine: DepthEngine, body: Path, json_length: str | None) -> Response:
+    background = engine.threads.background
+    pair = await background.run(_pair_of, body, json_length, engine.max_pixels)
+    height, width = pair.left.shape[:2]
+    rig = RectifiedRig(
+        width=width,
+        height=height,
+        fx=float(width),  # any focal length gives the same disparity
+        fy=float(width),
+        cx_left=(width - 1) / 2,
+        cx_right=(width - 1) / 2,
+        cy=(height - 1) / 2,
+        baseline_m=1.0,
+    )
+    config = StreamConfig(
+        StereoRig.from_rectified(rig), delivery=Delivery.EVERY, output=OutputFormat(sigma=True)
+    )
+    frame = StereoFrame(1, 0, pair.left, pair.right)
+    async with engine.offline(config) as stream:
+        disparity, _ = await engine.step_offline(stream, lambda: frame)
+    return await background.run(_answer, engine.card.name, pair.request, disparity)
+
+
+def _metadata(engine: DepthEngine) -> dict[str, Any]:
+    inputs = [{"name": each, "datatype": "UINT8", "shape": [1, -1, -1, 3]} for each in _INPUTS]
+    outputs = [{"name": each, "datatype": "FP32", "shape": [1, -1, -1]} for each in _OUTPUTS]
+    return {
+        "name": engine.card.name,
+        "versions": [_VERSION],
+        "platform": engine.computed_by,
+        "inputs": inputs,
+        "outputs": outputs,
+    }
+
+
+def _pair_of(body: Path, json_length: str | None, max_pixels: int) -> _Pair:
+    """Read a request. Raises BadShape, FrameTooLarge or UploadTooLarge."""
+    size = body.stat().st_size
+    if json_length is not None and not (json_length.isascii() and json_length.isdigit()):
+        raise BadShape(f"expected a number of bytes in {JSON_LENGTH}, got {json_length[:40]!r}")
+    length = size if json_length is None else int(json_length[:20])
+    if length > size:
+        raise BadShape(f"expected {length} bytes of JSON, got a body of {size}")
+    if length > _LARGEST_JSON:
+        raise UploadTooLarge(
+            f"expected JSON of at most {_LARGEST_JSON} bytes; send the tensors as binary data"
+        )
+    with body.open("rb") as file:
+        try:
+            request = _InferRequest.model_validate_json(file.read(length))
+        except ValidationError as error:
+            problems = "; ".join(
+                f"{'.'.join(map(str, each['loc']))}: {each['msg']}" for each in error.errors()[:3]
+            )
+            raise BadShape(problems) from None
+        if sorted(each.name for each in request.inputs) != ["left", "right"]:
+            raise BadShape("expected one input left and one input right")
+        images = {each.name: _image_of(each, file, max_pixels) for each in request.inputs}
+        if file.read(1):
+            raise BadShape("the body holds more bytes than its tensors")
+    left, right = images["left"], images["right"]
+    if left.shape != right.shape:
+        raise BadShape(f"expected two images of one shape, got {left.shape} and {right.shape}")
+    return _Pair(request, left, right)
+
+
+def _image_of(given: _Input, file: Any, max_pixels: int) -> Image:
+    batch, height, width, channels = given.shape
+    if batch != 1 or channels != 3 or height < 1 or width < 1:
+        raise BadShape(f"{given.name}: expected a shape of [1, H, W, 3], got {given.shape}")
+    if height * width > max_pixels:
+        raise FrameTooLarge(
+            f"{given.name}: expected at most {max_pixels} pixels, got {width}x{height}"
+        )
+    count = height * width * channels
+    size = given.parameters.binary_data_size
+    if size is not None:
+        if size != count:
+            raise BadShape(f"{given.name}: expected {count} bytes for its shape, got {size}")
+        values = np.frombuffer(file.read(count), np.uint8)
+    else:
+        values = _bytes_of(given)
+    if values.size != count:
+        raise BadShape(f"{given.name}: expected {count} values for its shape, got {values.size}")
+    return values.reshape(height, width, channels)
+
+
+def _bytes_of(given: _Input) -> NDArray[np.uint8]:
+    """The values in JSON: flat, or in lists of lists."""
+    try:
+        numbers = np.asarray(given.data if given.data is not None else [])
+        if numbers.dtype.kind not in "iu" or numbers.min() < 0 or numbers.max() > 255:
+            raise ValueError
+    except ValueError:
+        raise BadShape(f"{given.name}: expected whole numbers from 0 to 255 in data") from None
+    return numbers.astype(np.uint8).ravel()
+
+
+def _answer(model: str, request: _InferRequest, disparity: DisparityMap) -> Response:
+    assert disparity.sigma_px is not None
+    # JSON has no NaN: 0 is no value, as in the files of KITTI.
+    maps: Mapping[str, NDArray[np.float32]] = {
+        "disparity": np.nan_to_num(disparity.disparity_px, nan=0.0),
+        "sigma": disparity.sigma_px,
+    }
+    all_binary = request.parameters.binary_data_output
+    wanted: Sequence[tuple[str, bool]] = [
+        (each.name, each.parameters.binary_data) for each in request.outputs
+    ] or [(name, all_binary) for name in maps]
+    described: list[dict[str, Any]] = []
+    tensors: list[bytes] = []
+    for name, binary in wanted:
+        values = np.ascontiguousarray(maps[name], np.float32)
+        about: dict[str, Any] = {"name": name, "datatype": "FP32", "shape": [1, *values.shape]}
+        if binary:
+            tensors.append(values.astype("<f4").tobytes())
+            about["parameters"] = {"binary_data_size": len(tensors[-1])}
+        else:
+            about["data"] = values.ravel().tolist()
+        described.append(about)
+    answer: dict[str, Any] = {"model_name": model, "model_version": _VERSION, "outputs": described}
+    if request.id:
+        answer["id"] = request.id
+    head = json.dumps(answer).encode()
+    if not tensors:
+        return Response(head, media_type="application/json")
+    headers = {JSON_LENGTH: str(len(head))}
+    body = b"".join([head, *tensors])
+    return Response(body, media_type="application/octet-stream", headers=headers)
+
+
+def _unknown(model: str, own: str) -> Response:
+    return JSONResponse({"error": f"there is no model {model[:100]!r}, only {own}"}, 404)
+
+
+def _error(error: DepthError) -> Response:
+    return JSONResponse({"error": str(error)}, HTTP_STATUS[error.code])
