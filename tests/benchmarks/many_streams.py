@@ -1,19 +1,28 @@
-"""Measure how many steps a server takes for several live streams at once. Needs Linux.
+"""Measure how several live streams share one server. Needs Linux.
 
     python tests/benchmarks/many_streams.py --json FILE
 
 A real server process runs `lite` on the CPU. For each count of streams there are as many sessions
-of the SDK, each with a camera of its own: 640x480, newest wins, over loopback gRPC. Each row has:
+of the SDK, each with a camera of its own: 640x480, newest wins, over loopback gRPC. They have a
+process of their own. Each row has:
 
-- ``steps_per_s``: answers to all streams together.
-- ``p50_ms p95_ms``: time from capture to the moment that a client has the map, over all streams.
-- ``least_pct``: the answers to the stream that got the fewest, in percent of an equal share.
-- ``cpu_ms``: CPU time of the server per step, with transport and codec.
+- ``hz_sum``: answers to all streams together, per second.
+- ``jain``: Jain's index of the streams' rates; 1 means that all are equal.
+- ``age_p50_ms age_p99_ms``: time from capture to the moment that a client has the map.
+- ``age_ratio``: age_p50 over one step, one frame interval and the transport. The step is the median
+  of this row. The transport is the age of a lone stream without its step.
+- ``shed``: frames that were not answered with a map, in percent of those that cameras took.
+- ``cpu_ms``: CPU time of the server per answer, with transport and codec.
+
+``plain``: the same streams on a loop of 40 lines over the same model, without Vergence's service.
+``beside``: what a 30 Hz stream keeps of its fair share beside expensive neighbours. Its fair share
+is its camera's rate, or an equal part of what four streams get, if that is less.
 """
 
 import argparse
 import asyncio
 import json
+import multiprocessing
 import os
 import sys
 import time
@@ -21,6 +30,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,9 +38,53 @@ from vergence import DepthClient, DepthSession, Pose, RectifiedRig
 from vergence_proto.instruction_set import instruction_set
 from vergence_service.inference.onnx_model import packaged_weights_dir
 
-RIG = RectifiedRig(640, 480, 500.0, 500.0, 319.5, 319.5, 239.5, 0.1)
+sys.path.insert(0, str(Path(__file__).parents[2]))  # for tests.support
+
+from tests.support.plain_loop import plain_loop, plain_stream
+
 DISPARITY_PX = 12
 STAGGER_S = 0.013  # between the starts of two cameras, which are not synchronous
+LEAD_S = 3.0  # cameras run for so long before it counts
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """What one stream sends."""
+
+    rate_hz: float = 30.0
+    width: int = 640
+    height: int = 480
+    iterations: int = 0  # 0: the server's default
+    posed: bool = True
+
+    @property
+    def rig(self) -> RectifiedRig:
+        return RectifiedRig(
+            self.width, self.height, 0.8 * self.width, 0.8 * self.width,
+            (self.width - 1) / 2, (self.width - 1) / 2, (self.height - 1) / 2, 0.1,
+        )  # fmt: skip
+
+    def pair(self) -> tuple[Any, Any]:
+        shape = (self.height, self.width + DISPARITY_PX, 3)
+        noise = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
+        return noise[:, :-DISPARITY_PX].copy(), noise[:, DISPARITY_PX:].copy()
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What one stream got in the counted time."""
+
+    ages_s: list[float]
+    steps_s: list[float]  # time in the model
+    taken: int  # frames that the camera took
+
+
+# Neighbours of a healthy stream.
+BESIDE = {
+    "1 x 2048x1536": [Camera(width=2048, height=1536)],
+    "2 x 2048x1536": [Camera(width=2048, height=1536)] * 2,
+    "2 x 64 iterations": [Camera(iterations=64, posed=False)] * 2,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,97 +111,166 @@ async def serving(weights: Path, threads: int) -> AsyncIterator[Server]:
     assert process.stdout is not None
     try:
         _, grpc_address, _ = (await process.stdout.readline()).decode().split()
+        await process.stdout.readline()  # every graph is loaded
         yield Server(grpc_address.removeprefix("grpc="), process.pid)
     finally:
         process.terminate()
         await process.wait()
 
 
-async def stream(address: str, *, rate_hz: float, starts_s: float, counted_s: float) -> list[float]:
-    """Run a camera and its reader; return the ages in seconds of the maps of the counted time."""
-    noise = np.random.default_rng(0).integers(0, 256, (480, 640 + DISPARITY_PX, 3), np.uint8)
-    left, right = noise[:, :-DISPARITY_PX].copy(), noise[:, DISPARITY_PX:].copy()
+async def stream(address: str, camera: Camera, starts_s: float, counted_s: float) -> Outcome:
+    """Run a camera and its reader; return what came in the counted time."""
+    left, right = camera.pair()
     ages_s: list[float] = []
+    steps_s: list[float] = []
 
     async def film(session: DepthSession) -> None:
-        for index in range(int(rate_hz * (counted_s + 1.0))):
-            await asyncio.sleep(starts_s - 1.0 + index / rate_hz - time.monotonic())
-            session.submit(left, right, Pose.identity())
+        for index in range(int(camera.rate_hz * (counted_s + LEAD_S))):
+            await asyncio.sleep(starts_s - LEAD_S + index / camera.rate_hz - time.monotonic())
+            session.submit(left, right, Pose.identity() if camera.posed else None)
         session.end()
 
-    async with DepthClient(f"grpc://{address}") as client, client.open_session(RIG) as session:
-        camera = asyncio.create_task(film(session))
+    async with (
+        DepthClient(f"grpc://{address}") as client,
+        client.open_session(
+            camera.rig, iterations=camera.iterations, cold_iterations=camera.iterations
+        ) as session,
+    ):
+        filming = asyncio.create_task(film(session))
         async for result in session:
-            now_s = time.monotonic()
-            if starts_s <= now_s < starts_s + counted_s:
-                age_s = (time.monotonic_ns() - result.capture_ns) * 1e-9
-                ages_s.append(age_s)
-        await camera
-    return ages_s
+            if starts_s <= time.monotonic() < starts_s + counted_s:
+                ages_s.append((time.monotonic_ns() - result.capture_ns) * 1e-9)
+                steps_s.append(result.timings.model_s)
+        await filming
+    return Outcome(ages_s, steps_s, int(camera.rate_hz * counted_s))
+
+
+def in_a_process(
+    address: str, cameras: list[Camera], starts_s: float, counted_s: float, plain: bool
+) -> list[Outcome]:
+    one = plain_stream if plain else stream
+
+    async def all_of_them() -> list[Outcome]:
+        outcomes: list[Outcome] = await asyncio.gather(
+            *(
+                one(address, camera, starts_s + index * STAGGER_S, counted_s)
+                for index, camera in enumerate(cameras)
+            )
+        )
+        return outcomes
+
+    return asyncio.run(all_of_them())
 
 
 async def together(
-    server: Server, count: int, *, rate_hz: float, seconds: float
-) -> dict[str, float]:
-    starts_s = time.monotonic() + 1.5  # before it, streams open and warm up for a second
-    async with asyncio.TaskGroup() as tasks:
-        streams = [
-            tasks.create_task(
-                stream(
-                    server.address,
-                    rate_hz=rate_hz,
-                    starts_s=starts_s + index * STAGGER_S,
-                    counted_s=seconds,
-                )
-            )
-            for index in range(count)
-        ]
+    server: Server, cameras: list[Camera], *, seconds: float, plain: bool = False
+) -> tuple[list[Outcome], float]:
+    """Run the cameras in a process of their own; return also the server's CPU time."""
+    starts_s = time.monotonic() + 2.0 + LEAD_S + 0.1 * len(cameras)
+    loop = asyncio.get_running_loop()
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        running = loop.run_in_executor(
+            None, pool.apply, in_a_process, (server.address, cameras, starts_s, seconds, plain)
+        )
         await asyncio.sleep(starts_s - time.monotonic())
         before_s = server.cpu_s()
         await asyncio.sleep(starts_s + seconds - time.monotonic())
         cpu_s = server.cpu_s() - before_s
-    ages_s = [task.result() for task in streams]
-    steps = sum(map(len, ages_s))
-    p50, p95 = np.percentile(np.concatenate(ages_s), [50, 95])
+        return await running, cpu_s
+
+
+def row(
+    outcomes: list[Outcome], cpu_s: float, *, seconds: float, rate_hz: float, transport_s: float
+) -> dict[str, float]:
+    counts = np.array([len(each.ages_s) for each in outcomes])
+    ages_s = np.concatenate([each.ages_s for each in outcomes])
+    step_s = float(np.median(np.concatenate([each.steps_s for each in outcomes])))
+    p50, p99 = np.percentile(ages_s, [50, 99])
     return {
-        "steps_per_s": steps / seconds,
-        "p50_ms": 1e3 * p50,
-        "p95_ms": 1e3 * p95,
-        "least_pct": 100 * min(map(len, ages_s)) * count / steps,
-        "cpu_ms": 1e3 * cpu_s / steps,
+        "hz_sum": counts.sum() / seconds,
+        "jain": counts.sum() ** 2 / (len(counts) * (counts**2).sum()),
+        "age_p50_ms": 1e3 * p50,
+        "age_p99_ms": 1e3 * p99,
+        "age_ratio": p50 / (step_s + 1 / rate_hz + transport_s),
+        "step_ms": 1e3 * step_s,
+        "shed": 100 * (1 - counts.sum() / sum(each.taken for each in outcomes)),
+        "cpu_ms": 1e3 * cpu_s / max(counts.sum(), 1),
     }
 
 
-async def measure(args: argparse.Namespace) -> dict[int, dict[str, float]]:
+async def rows_of(server: Server, args: argparse.Namespace, *, plain: bool) -> dict[str, Any]:
+    offers = [(f"{count}", count, args.rate_hz) for count in args.streams]
+    if not args.no_fast:
+        offers.append(("4 at 72 and 15 Hz", 4, 72.0))
+    rows: dict[str, Any] = {}
+    transport_s = 0.0
+    for name, count, rate_hz in offers:
+        rates = [rate_hz] * count if rate_hz == args.rate_hz else [72.0, 72.0, 15.0, 15.0]
+        cameras = [Camera(rate_hz=each) for each in rates]
+        outcomes, cpu_s = await together(server, cameras, seconds=args.seconds, plain=plain)
+        if count == 1:
+            lone = outcomes[0]
+            transport_s = float(np.median(lone.ages_s) - np.median(lone.steps_s))
+        rows[name] = row(
+            outcomes, cpu_s, seconds=args.seconds, rate_hz=rate_hz, transport_s=transport_s
+        )
+        show(("plain " if plain else "") + name, rows[name])
+    return rows
+
+
+async def measure(args: argparse.Namespace) -> dict[str, Any]:
+    figures: dict[str, Any] = {}
     async with serving(args.weights, args.threads) as server:
-        return {
-            count: await together(server, count, rate_hz=args.rate_hz, seconds=args.seconds)
-            for count in args.streams
-        }
+        figures["streams"] = await rows_of(server, args, plain=False)
+        four = figures["streams"].get("4")
+        if four and not args.no_beside:
+            figures["beside"] = {}
+            for name, neighbours in BESIDE.items():
+                healthy = Camera(rate_hz=args.rate_hz)
+                outcomes, _ = await together(server, [healthy, *neighbours], seconds=args.seconds)
+                hz = len(outcomes[0].ages_s) / args.seconds
+                fair = min(args.rate_hz, four["hz_sum"] / len(outcomes))
+                others = sum(len(each.ages_s) for each in outcomes[1:]) / args.seconds
+                kept = {"hz": hz, "fair_hz": fair, "kept": hz / fair, "others_hz": others}
+                figures["beside"][name] = kept
+                show(f"beside {name}", kept)
+    if not args.no_plain:
+        with plain_loop(args.weights, args.threads) as (address, pid):
+            plain = await rows_of(Server(address, pid), args, plain=True)
+        figures["plain"] = plain
+    return figures
+
+
+def show(name: str, values: dict[str, float]) -> None:
+    print(  # noqa: T201
+        f"{name:28}" + " ".join(f"{key} {value:.2f}" for key, value in values.items()), flush=True
+    )
+
+
+def rounded(values: Any) -> Any:
+    if isinstance(values, dict):
+        return {key: rounded(value) for key, value in values.items()}
+    return round(float(values), 3)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--json", type=Path, help="write the figures there")
     parser.add_argument("--weights", type=Path, default=packaged_weights_dir())
-    parser.add_argument("--streams", type=int, nargs="+", default=[1, 2, 4])
+    parser.add_argument("--streams", type=int, nargs="+", default=[1, 2, 4, 8, 16])
     parser.add_argument("--rate-hz", type=float, default=30.0, help="of every camera")
-    parser.add_argument("--seconds", type=float, default=8.0, help="that are counted, per count")
+    parser.add_argument("--seconds", type=float, default=8.0, help="that are counted, per row")
     parser.add_argument("--threads", type=int, default=2, help="of the model")
+    parser.add_argument("--no-plain", action="store_true", help="without the plain loop")
+    parser.add_argument("--no-beside", action="store_true", help="without expensive neighbours")
+    parser.add_argument("--no-fast", action="store_true", help="without 72 and 15 Hz")
     args = parser.parse_args()
-    figures = {
-        str(count): {name: round(float(value), 2) for name, value in row.items()}
-        for count, row in asyncio.run(measure(args)).items()
-    }
-    columns = list(next(iter(figures.values())))
     print(f"isa {instruction_set()}")  # noqa: T201
-    print("streams" + "".join(f"{name:>13}" for name in columns))  # noqa: T201
-    for count, row in figures.items():
-        print(f"{count:7}" + "".join(f"{row[name]:13.2f}" for name in columns))  # noqa: T201
+    figures = rounded(asyncio.run(measure(args)))
     if args.json:
         settings = {key: vars(args)[key] for key in ("rate_hz", "seconds", "threads")}
         settings["isa"] = instruction_set()
-        args.json.write_text(json.dumps({**settings, "streams": figures}, indent=1) + "\n")
+        args.json.write_text(json.dumps({**settings, **figures}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -34,7 +34,9 @@ from vergence_service.settings import Settings
 from vergence_service.streams.continuity import ContinuityLimits
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.needs import ImageSizes
+from vergence_service.streams.stream import Stream
 from vergence_service.streams.table import StreamTable
+from vergence_service.streams.turns import Turns
 from vergence_service.threads import Threads
 from vergence_service.transports.addresses import format_address
 from vergence_service.transports.grpc.server import DepthServicer, GrpcServer
@@ -99,6 +101,18 @@ async def running(
     batcher = StepBatcher(
         model, max_batch=settings.model.max_batch, memory=memory, clock=clock, metrics=metrics
     )
+    # One more than the model takes at once, decoded ahead, so that no lane waits.
+    at_once = max(model.max_concurrent_steps, settings.model.max_batch)
+    turns = Turns(
+        places=2 * at_once if settings.model.max_batch > 1 else at_once + 1,
+        lanes=model.max_concurrent_steps,
+        clock=clock,
+    )
+
+    def closed(stream: Stream) -> None:
+        batcher.forget(stream.key)
+        turns.forget(stream.key)
+
     streams = StreamTable(
         capacity=settings.streams.capacity,
         per_client=settings.limits.streams_per_client,
@@ -110,7 +124,7 @@ async def running(
         silent_s=settings.limits.silent_s,
         clock=clock,
         metrics=metrics,
-        on_closed=lambda stream: batcher.forget(stream.key),
+        on_closed=closed,
     )
     threads = Threads(lanes=model.max_concurrent_steps)
     engine = DepthEngine(
@@ -131,6 +145,7 @@ async def running(
         clock=clock,
         metrics=metrics,
         threads=threads,
+        turns=turns,
     )
     max_frame_bytes = settings.limits.max_frame_mib * _MIB
     limits = StreamLimits(

@@ -35,6 +35,7 @@ from vergence_service.streams.rectify import Rectifier, check_rig
 from vergence_service.streams.search_window import SearchReach
 from vergence_service.streams.stream import Attachment, Notice, NoticeKind, Stream, StreamConfig
 from vergence_service.streams.table import StreamTable
+from vergence_service.streams.turns import Turns
 from vergence_service.threads import ThreadPool, Threads
 
 # A client that comes while the model loads waits for at most this long. It is below the time that
@@ -71,8 +72,10 @@ class DepthEngine:
         clock: Callable[[], float],
         metrics: Metrics,
         threads: Threads,
+        turns: Turns | None = None,
     ) -> None:
         self.streams = streams
+        self.turns = Turns(places=2, lanes=1, clock=clock) if turns is None else turns
         self.card = model.card
         self.memory = memory
         self.max_pixels = sizes.max_pixels

@@ -77,6 +77,12 @@ class Mailbox:
             self._finished = True
             self._changed.notify_all()
 
+    async def filled(self) -> bool:
+        """Wait until a frame waits, and return True; False if no more frames come."""
+        async with self._changed:
+            await self._changed.wait_for(lambda: bool(self._frames) or self._finished)
+            return bool(self._frames)
+
     async def take(self) -> QueuedFrame | None:
         """Wait for the oldest frame and return it, or None if no more frames come."""
         async with self._changed:

@@ -59,6 +59,15 @@ class Outbox:
         """Add an answer as it is."""
         await self._answers.put(answer)
 
+    @property
+    def full(self) -> bool:
+        """True while there is no room for another answer."""
+        return self._answers.full()
+
+    def put_now(self, answer: pb.StreamDepthResponse) -> None:
+        """Add an answer; there must be room."""
+        self._answers.put_nowait(answer)
+
     def put_notice(self, notice: Notice) -> None:
         """Add a notice if there is room. A client that does not read would not read it either."""
         message = pb.Notice(kind=_NOTICE[notice.kind], message=notice.message, in_s=notice.in_s)

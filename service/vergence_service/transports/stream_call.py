@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from functools import partial
 
@@ -10,8 +11,11 @@ from vergence_proto.errors import DepthError, StreamExists, StreamExpired, Unkno
 from vergence_proto.types import Delivery
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.access.principals import Principal
+from vergence_service.streams.conversion import SteppedFrame
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.stream import Notice, Stream, StreamConfig
+from vergence_service.streams.turns import Turn
+from vergence_service.transports.displaced import DisplacedFrames
 from vergence_service.transports.mailbox import Mailbox, QueuedFrame
 from vergence_service.transports.outbox import Outbox
 from vergence_service.transports.unary import model_info
@@ -67,6 +71,7 @@ class DepthCall:
         self._outbox = Outbox(
             self._write_in_time, clock=clock, metrics=engine.metrics, threads=engine.threads.live
         )
+        self._displaced = DisplacedFrames(self._outbox, on_reported=self._answered)
         self._reader: asyncio.Task[None] | None = None
         self._stepper: asyncio.Task[None] | None = None
         self._stream: Stream | None = None
@@ -271,8 +276,8 @@ class DepthCall:
             return
         if displaced is not None:
             displaced.memory.release()
-            await self._drop(stream, [displaced.frame_id])
-            self._answered()
+            self._engine.count_dropped(stream)
+            await self._displaced.add(displaced.frame_id)
 
     async def _keep(
         self, stream: Stream, mailbox: Mailbox, frame: codec.ReceivedFrame, arrived_s: float
@@ -296,31 +301,56 @@ class DepthCall:
         await self._outbox.put(pb.StreamDepthResponse(frames_dropped=dropped))
 
     async def _step(self, stream: Stream, mailbox: Mailbox) -> None:
-        size = stream.rectifier.rig.width, stream.rectifier.rig.height
         while True:
             await self._outbox.reserve_map()
-            queued = await mailbox.take()
-            if queued is None:
+            if not await mailbox.filled():
+                await self._displaced.report()
                 return
-            fields = queued.frame.fields
-            try:
-                if queued.reset_before:
-                    await self._engine.reset(stream.stream_id, owner=stream.owner.name)
-                stepped = await self._engine.step(
-                    stream.stream_id,
-                    partial(codec.decode_frame, queued.frame, size=size),
-                    arrived_s=queued.arrived_s,
-                    owner=stream.owner.name,
-                    max_age_s=fields.max_age_s if fields.HasField("max_age_s") else None,
-                )
-            except DepthError as error:
-                self._outbox.release_map()
-                await self._refuse(queued.frame_id, error)
-            else:
-                await self._outbox.put_map(stepped, map_step=fields.map_step)
+            async with self._turn(stream) as turn:
+                queued = await mailbox.take()
+                if queued is None:
+                    return
+                stepped = await self._stepped(stream, queued)
+                if turn is not None and stepped is not None:
+                    turn.cost_s = stepped.timings.model_s
+            # Not in the turn: the client may be slow to read.
+            if stepped is not None:
+                await self._outbox.put_map(stepped, map_step=queued.frame.fields.map_step)
                 self._answered()
-            finally:
-                queued.memory.release()
+
+    @asynccontextmanager
+    async def _turn(self, stream: Stream) -> AsyncIterator[Turn | None]:
+        """Wait for a turn of a live stream. The steps of others run in the gaps."""
+        if stream.config.delivery is not Delivery.NEWEST:
+            yield None
+            return
+        self._displaced.wait()
+        async with self._engine.turns.turn(
+            stream.key, stream.owner, on_soon=self._displaced.report_now
+        ) as turn:
+            self._displaced.begin()
+            yield turn
+
+    async def _stepped(self, stream: Stream, queued: QueuedFrame) -> SteppedFrame | None:
+        """Step a frame; None if it failed and was answered with the error."""
+        size = stream.rectifier.rig.width, stream.rectifier.rig.height
+        fields = queued.frame.fields
+        try:
+            if queued.reset_before:
+                await self._engine.reset(stream.stream_id, owner=stream.owner.name)
+            return await self._engine.step(
+                stream.stream_id,
+                partial(codec.decode_frame, queued.frame, size=size),
+                arrived_s=queued.arrived_s,
+                owner=stream.owner.name,
+                max_age_s=fields.max_age_s if fields.HasField("max_age_s") else None,
+            )
+        except DepthError as error:
+            self._outbox.release_map()
+            await self._refuse(queued.frame_id, error)
+            return None
+        finally:
+            queued.memory.release()
 
     async def _refuse(self, frame_id: int, error: DepthError) -> None:
         message = codec.error_to_frame_error(frame_id, error)
