@@ -61,9 +61,9 @@ async def test_principals_share_the_model_by_its_seconds_and_their_weights() -> 
     streams = {"a1": ana, "a2": ana, "a3": ana, "a4": ana, "b": ben}
     costs_s = {"a1": 0.03, "a2": 0.03, "a3": 0.03, "a4": 0.03, "b": 0.04}
     model = Model(costs_s)
-    await model.run(streams, 60)
+    await model.run(streams, 30)
     # 4 ms is a tenth of a percent of the time: one step more or less.
-    assert model.used_s["ben"] / model.used_s["ana"] == pytest.approx(3.0, rel=0.02)
+    assert model.used_s["ben"] / model.used_s["ana"] == pytest.approx(3.0, rel=0.03)
     turns = [model.count[name] for name in ("a1", "a2", "a3", "a4")]
     assert max(turns) - min(turns) <= 1
 
@@ -71,8 +71,8 @@ async def test_principals_share_the_model_by_its_seconds_and_their_weights() -> 
 async def test_streams_of_one_principal_share_its_part_by_seconds() -> None:
     one = Principal("local")
     model = Model({"cheap": 0.02, "dear": 0.05})
-    await model.run({"cheap": one, "dear": one}, 60)
-    assert model.count["cheap"] / model.count["dear"] == pytest.approx(2.5, rel=0.03)
+    await model.run({"cheap": one, "dear": one}, 30)
+    assert model.count["cheap"] / model.count["dear"] == pytest.approx(2.5, rel=0.05)
 
 
 async def test_long_steps_leave_a_lane_to_short_ones() -> None:
@@ -88,7 +88,7 @@ async def test_long_steps_leave_a_lane_to_short_ones() -> None:
 async def test_nobody_saves_turns_for_later() -> None:
     model = Model({"early": 0.1, "late": 0.1})
     ana, ben = Principal("ana"), Principal("ben")
-    await model.run({"early": ana}, 1000)
+    await model.run({"early": ana}, 100)
     model.used_s.clear()
     await model.run({"early": ana, "late": ben}, 20)
     assert model.used_s["ben"] == pytest.approx(model.used_s["ana"], abs=0.7)
