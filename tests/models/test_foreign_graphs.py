@@ -230,6 +230,16 @@ def test_weights_that_were_not_trained_are_refused_or_said_to_be_unproven(tmp_pa
     assert read_manifest(tmp_path / "to")["models"]["r"]["foreign"]["proven"] is False
 
 
+def test_a_graph_that_looks_at_one_image_only_is_found_out(tmp_path: Path) -> None:
+    graph = two_images("left", "right", "out", BYTES)
+    for node in graph.graph.node:
+        for index, name in enumerate(node.input):
+            if name == "right":
+                node.input[index] = "left"
+    with pytest.raises(ContractError, match="one image: the right image changes nothing"):
+        add(tmp_path / "to", written(graph, tmp_path / "a.onnx"))
+
+
 def three_images() -> onnx.ModelProto:
     graph = two_images("left", "right", "out", BYTES)
     shape = [1, 3, HEIGHT, WIDTH]

@@ -20,6 +20,7 @@ from tests.support.foreign_graphs import (
     refining,
     written,
 )
+from tests.support.moved_flow import moved_flow
 from tests.support.server import running_server
 from tests.support.session_frames import EXACT
 from vergence import Delivery, DepthClient, Origin
@@ -28,13 +29,6 @@ from vergence_models.foreign.contract import ContractError, SigmaFrom
 from vergence_models.foreign.files import write_model
 from vergence_models.foreign.guess import Given
 from vergence_models.foreign.textures import texture
-from vergence_models.networks.warp import (
-    MIN_DISPARITY_PX,
-    cell_centres,
-    fill_cracks,
-    splat_nearest,
-    transform_uvd,
-)
 from vergence_proto.geometry import Pose, RectifiedRig
 from vergence_proto.types import PoseSample
 from vergence_service.inference.model import RecurrentState, Step, StereoView
@@ -189,20 +183,6 @@ def in_torch(frame: Frame, flow_init: torch.Tensor) -> torch.Tensor:
     return (start[:, 0] + cost.argmin(dim=1) - REACH_PX)[0]
 
 
-def moved_in_torch(disparity: NDArray[np.float32], uvd: NDArray[np.float32]) -> torch.Tensor:
-    """The disparity [H, W] as flow_init [1, 2, h, w], moved by the warp of our own networks."""
-    middle = FLOW_CELL_PX // 2
-    cells = torch.from_numpy(disparity[None, middle::FLOW_CELL_PX, middle::FLOW_CELL_PX].copy())
-    _, height, width = cells.shape
-    u, v = cell_centres(height, width, FLOW_CELL_PX, cells)
-    u_to, v_to, d_to = transform_uvd(torch.from_numpy(uvd)[None], u, v, cells)
-    d_to = d_to * (cells > MIN_DISPARITY_PX)
-    column, row = (torch.floor((each + 0.5) / FLOW_CELL_PX) for each in (u_to, v_to))
-    landed = fill_cracks(splat_nearest(d_to, column, row))
-    x = -landed[:, None] / FLOW_CELL_PX
-    return torch.cat((x, torch.zeros_like(x)), dim=1)
-
-
 def test_over_a_sequence_the_answers_are_those_of_pytorch_with_the_same_flow(
     model: OnnxStereoModel, footage: list[Frame]
 ) -> None:
@@ -220,7 +200,7 @@ def test_over_a_sequence_the_answers_are_those_of_pytorch_with_the_same_flow(
         pose = Pose(np.linalg.matrix_power(rotation, i), frame.pose.translation_m)
         view = StereoView(frame.left, frame.right, RIG, frame.capture_ns, pose)
         step = Step(view, result.state, 1)
-        flow = moved_in_torch(result.offset_px, step.uvd_curr_from_prev)
+        flow = moved_flow(result.offset_px, step.uvd_curr_from_prev, cell_px=FLOW_CELL_PX)
         [result] = model.step([step])
         expected = in_torch(frame, flow).numpy()
         same = np.abs(result.offset_px - expected) < 1e-3

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vergence_models.foreign.contract import Contract, ContractError
-from vergence_models.foreign.textures import Plane, Scene, scene
+from vergence_models.foreign.textures import Plane, Scene, scene, texture
 from vergence_models.foreign.trial import Network, Trial
 from vergence_proto.model_io import DISPARITY
 
@@ -57,6 +57,7 @@ class Proof:
     contract: Contract | None
     seen: Seen  # under the contract that was tried first, or the one that was found
     as_good: tuple[str, ...]  # other ranges of the pixels that the textures cannot rule out
+    blind_to: str = ""  # an image that changes nothing
 
 
 def texture_size(contract: Contract, range_px: int = 64) -> tuple[int, int]:
@@ -162,7 +163,20 @@ def prove(contract: Contract, network: Network, *, search_pixels: bool = False) 
         assert factor is not None
         found = replace(contract, pixels=chosen, swapped=swapped, factor=factor)
         return Proof(found, matched[chosen], tuple(each for each in as_good if each != chosen))
-    return Proof(None, own, ())
+    return Proof(None, own, (), _blind_to(contract, network))
+
+
+def _blind_to(contract: Contract, network: Network) -> str:
+    """Return the image that the output does not depend on; empty if it depends on both."""
+    trial = Trial(replace(contract, sigma="constant"), network)
+    pair = scenes_for(contract)[0]
+    height, width = texture_size(contract)
+    other = texture(height, width, 99)
+    seen = trial.disparity_px(pair.left, pair.right)
+    for side, images in (("right", (pair.left, other)), ("left", (other, pair.right))):
+        if np.array_equal(seen, trial.disparity_px(*images)):
+            return side
+    return ""
 
 
 def warm_shares(
@@ -227,6 +241,11 @@ def found_range_px(contract: Contract, network: Network, at_most: int) -> int:
 def differences(given: Contract, proof: Proof) -> list[str]:
     """Return what is wrong with a contract, a sentence each; empty if it is proven."""
     found = proof.contract
+    if proof.blind_to:
+        return [
+            f"one image: the {proof.blind_to} image changes nothing in the output; exporters join "
+            "the two if they are given the same example for both"
+        ]
     if found is None:
         return [
             f"no match: the output is {proof.seen.words} of disparity, under every order of the "
