@@ -2,7 +2,12 @@
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 
-_STAGE_BUCKETS_S = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.033, 0.05, 0.1, 0.2, 0.5, 1.0)
+from vergence_proto.errors import ErrorCode
+
+_STAGE_BUCKETS_S = (
+    *(0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.033, 0.05, 0.1, 0.2, 0.5),
+    *(1.0, 2.0, 5.0, 10.0),
+)
 _SEQUENCE_BUCKETS_S = (0.1, 0.5, 1, 5, 10, 30, 60, 300, 600, 1800, 3600, 7200)
 
 
@@ -25,6 +30,48 @@ class Metrics:
             "vergence_frames_failed",
             "Frames that were answered with an error",
             ["reason"],
+            registry=registry,
+        )
+        for code in ErrorCode:  # a rate needs a series from the start
+            self.frames_failed.labels(code)
+        self.frame_age_s = Histogram(
+            "vergence_frame_age_seconds",
+            "Time from a frame's arrival to its answer",
+            buckets=_STAGE_BUCKETS_S,
+            registry=registry,
+        )
+        self.model_s = Counter(
+            "vergence_model_seconds",
+            "Time in the model, of live streams",
+            ["principal"],
+            registry=registry,
+        )
+        self.turns_waiting = Gauge(
+            "vergence_turns_waiting", "Live streams that wait for the model", registry=registry
+        )
+        self.openings = Counter(
+            "vergence_openings", "Openings of streams", ["outcome"], registry=registry
+        )
+        for outcome in ("opened", "resumed", *ErrorCode):
+            self.openings.labels(outcome)
+        self.calls_ended = Counter(
+            "vergence_calls_ended",
+            "StreamDepth calls that have ended",
+            ["transport", "reason"],
+            registry=registry,
+        )
+        for transport in ("grpc", "http", "zenoh"):
+            for reason in ("done", "lost", "left"):
+                self.calls_ended.labels(transport, reason)
+        self.streams_expired = Counter(
+            "vergence_streams_expired", "Streams that have expired", ["why"], registry=registry
+        )
+        for why in ("idle", "detached"):
+            self.streams_expired.labels(why)
+        self.build_info = Gauge(
+            "vergence_build_info",
+            "1, with the versions as labels",
+            ["version", "model", "weights", "engine", "provider"],
             registry=registry,
         )
         self.stage_s = Histogram(

@@ -223,7 +223,7 @@ async def test_a_principal_that_has_its_share_leaves_room_to_others(guarded: Gua
         for call in kept:
             call.call.cancel()
     await eventually(lambda: not guarded.server.engine.streams.attachments())
-    guarded.server.engine.end_those_of(lambda owner: owner != LOCAL)
+    guarded.server.engine.streams.end_those_of(lambda owner: owner != LOCAL)
 
 
 async def test_removing_a_token_ends_its_streams(guarded: Guarded) -> None:

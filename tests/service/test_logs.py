@@ -12,7 +12,7 @@ import pytest
 from tests.support.server import ManualClock
 from vergence_proto.errors import BadShape, ModelFailed, NotReady, StateMemory
 from vergence_service.failures import error_of
-from vergence_service.logs import BoundedRate
+from vergence_service.logs import BoundedRate, JsonLines
 from vergence_service.native_output import decoder_of
 
 
@@ -137,3 +137,14 @@ def test_decoders_are_counted_and_write_nothing() -> None:
     assert other.startswith("log: another library")
     assert json.loads(counts)["png"] > 0
     assert json.loads(counts)["jpeg"] > 0
+
+
+def test_an_event_is_one_json_object_with_its_fields() -> None:
+    record = logging.LogRecord(
+        "a", logging.INFO, "a.py", 1, "%s", ("stream closed stream=x",), None
+    )
+    record.vergence_fields = {"event": "stream closed", "stream": "x", "principal": "ana"}
+    line = json.loads(JsonLines().format(record))
+    assert (line["event"], line["stream"], line["principal"]) == ("stream closed", "x", "ana")
+    assert line["time"].endswith("Z")
+    assert line["level"] == "info"

@@ -362,6 +362,20 @@ def _doctor(
         _await(examine_link(server, seconds, console))
 
 
+@app.command("top")
+def _top(
+    server: Annotated[
+        str, typer.Option(help="http[s]://HOST:PORT of the administrator's port.")
+    ] = "http://127.0.0.1:8001",
+    every: Annotated[float, typer.Option(min=0.1, help="Seconds between two looks.")] = 1.0,
+    once: Annotated[bool, typer.Option("--once", help="Print the table once.")] = False,
+) -> None:
+    """Show the open streams of a server: rate, age, origin, drops, time in the model."""
+    from vergence.cli.top import top
+
+    _await(top(server, _console(), every_s=every, once=once))
+
+
 def _add_contributed(entry: metadata.EntryPoint) -> None:
     """Add the command of another package; if it cannot be loaded, the command says why."""
     try:

@@ -51,7 +51,7 @@ def run_server(
             return
         os.umask(0o077)  # what clients send is for nobody else on this machine
         check_exposure(settings)
-        start_logging(settings.log_level)
+        start_logging(settings.log_level, form=settings.log_format)
         save_address_space()
         keep_freed_memory()
         raise_descriptor_limit()

@@ -81,7 +81,7 @@ async def keep_current(gate: Gate, certificate: Certificate | None, engine: Dept
         if certificate is not None:
             certificate.reload()
         if gate.tokens is not None and gate.tokens.reload():
-            engine.end_those_of(lambda owner: not gate.valid(owner.name, owner.credential))
+            engine.streams.end_those_of(lambda owner: not gate.valid(owner.name, owner.credential))
 
 
 def is_loopback(host: str) -> bool:

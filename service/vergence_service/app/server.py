@@ -5,9 +5,10 @@ import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager, closing
 from dataclasses import dataclass
+from importlib.metadata import version
 from typing import Any
 
-from prometheus_client import CollectorRegistry
+from prometheus_client import CollectorRegistry, ProcessCollector
 
 from vergence_proto.model_io import folder_of_model, user_models_dir
 from vergence_proto.stopping import STOP_SIGNALS, on_end_of_input, on_signals
@@ -97,6 +98,14 @@ async def running(
     gate, certificate = make_gate(settings), make_certificate(settings)
     registry = CollectorRegistry()
     metrics = Metrics(registry)
+    metrics.build_info.labels(
+        version("vergence"),
+        model.card.name,
+        model.card.weights_sha256[:12],
+        model.engine,
+        model.provider,
+    ).set(1)
+    ProcessCollector(registry=registry)
     memory = MemoryBudget(settings.limits.max_state_mib * _MIB, metrics=metrics)
     batcher = StepBatcher(
         model, max_batch=settings.model.max_batch, memory=memory, clock=clock, metrics=metrics
@@ -108,6 +117,8 @@ async def running(
         lanes=model.max_concurrent_steps,
         clock=clock,
     )
+
+    metrics.turns_waiting.set_function(lambda: len(turns))
 
     def closed(stream: Stream) -> None:
         batcher.forget(stream.key)

@@ -76,6 +76,9 @@ class Settings(BaseSettings):
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         default="info", description="least severe messages to log"
     )
+    log_format: Literal["text", "json"] = Field(
+        default="text", description="form of the log's lines; json: in UTC, with fields"
+    )
     server: ServerSettings = ServerSettings()
     grpc: GrpcSettings = GrpcSettings()
     http: HttpSettings = HttpSettings()
@@ -91,7 +94,10 @@ class Settings(BaseSettings):
     def to_toml(self) -> str:
         """The settings as a file, with the meaning of each key."""
         sections = {name: value for name, value in self if isinstance(value, Section)}
-        lines = [f"log_level = {json.dumps(self.log_level)}"]
+        lines = [
+            f"log_level = {json.dumps(self.log_level)}",
+            f"log_format = {json.dumps(self.log_format)}",
+        ]
         for name, section in sections.items():
             lines += ["", f"[{name}]", *_toml_lines(section)]
         return "\n".join(lines) + "\n"

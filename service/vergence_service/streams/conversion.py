@@ -1,5 +1,6 @@
 """Convert between a client's frames and the model's views: rectification, axes, missing values."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ from vergence_proto.accuracy import confidence_from_sigma
 from vergence_proto.errors import BadShape
 from vergence_proto.geometry import Axes, Pose
 from vergence_proto.types import DisparityMap, Origin, StereoFrame, Timings
+from vergence_service.failures import out_of_memory
 from vergence_service.inference.model import StepResult, StereoView
 from vergence_service.streams.rectify import Rectifier
 from vergence_service.streams.stream import Stream
@@ -76,3 +78,14 @@ class SteppedFrame:
             timings=self.timings,
             max_disparity_px=rectifier.window.max_disparity_px,
         )
+
+
+def decoded_view(
+    decode: Callable[[], StereoFrame], stream: Stream
+) -> tuple[StereoFrame, StereoView]:
+    """Decode a frame, and make the view that the model steps. Call it in a worker thread."""
+    try:
+        frame = decode()
+        return frame, view_from_frame(frame, stream.rectifier, stream.config.axes)
+    except MemoryError:
+        raise out_of_memory() from None

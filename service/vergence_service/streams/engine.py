@@ -11,7 +11,6 @@ from vergence_proto.errors import (
     ModelChanged,
     NonFinite,
     NotReady,
-    Unauthenticated,
     UnknownStream,
 )
 from vergence_proto.types import (
@@ -25,11 +24,11 @@ from vergence_proto.types import (
 from vergence_service.access.principals import LOCAL, Principal
 from vergence_service.failures import out_of_memory
 from vergence_service.inference.batcher import StepBatcher
-from vergence_service.inference.model import RecurrentState, Step, StereoModel, StereoView
+from vergence_service.inference.model import RecurrentState, Step, StereoModel
 from vergence_service.memory import MemoryBudget, StreamMemory
 from vergence_service.metrics import Metrics
 from vergence_service.streams.continuity import ContinuityLimits
-from vergence_service.streams.conversion import SteppedFrame, view_from_frame
+from vergence_service.streams.conversion import SteppedFrame, decoded_view
 from vergence_service.streams.needs import ImageSizes, stream_memory
 from vergence_service.streams.rectify import Rectifier, check_rig
 from vergence_service.streams.search_window import SearchReach
@@ -296,14 +295,6 @@ class DepthEngine:
         stream.frames_skipped += 1
         self.metrics.frames_failed.labels(error.code).inc()
 
-    def end_those_of(self, gone: Callable[[Principal], bool]) -> None:
-        """End the streams of principals whose credential is gone."""
-        for stream in self.streams:
-            if gone(stream.owner):
-                self.streams.close(stream)
-                if stream.attachment is not None:
-                    stream.attachment.end(Unauthenticated("the token was removed"))
-
     async def close(self, stream_id: str, *, owner: str = LOCAL.name) -> None:
         """End a stream and free its state; any connection of its owner may ask for it.
 
@@ -368,7 +359,7 @@ class DepthEngine:
             try:
                 started_s = self._clock()
                 skipped = stream.frames_skipped
-                frame, view = await pool.run(_decoded_view, decode, stream)
+                frame, view = await pool.run(decoded_view, decode, stream)
                 decode_s = self._clock() - started_s
                 stream.check_order(frame.frame_id)
                 state, origin = stream.state_before(view, self._limits)
@@ -386,10 +377,9 @@ class DepthEngine:
                     self._forget(stream, Origin.RESET_NON_FINITE)
                 raise
             stream.commit(frame.frame_id, result.state, frames_skipped=skipped)
-        now_s = self._clock()
-        stream.answers.append((now_s, now_s - arrived_s))
-        stream.last_origin = origin
-        stream.model_s += timings.model_s
+        stream.note_answer(self._clock(), arrived_s, origin, timings.model_s)
+        if live:
+            self.metrics.model_s.labels(stream.owner.name).inc(timings.model_s)
         self.metrics.frames_stepped.labels(origin.name.lower()).inc()
         for stage in ("decode", "queue", "model"):
             self.metrics.stage_s.labels(stage).observe(getattr(timings, f"{stage}_s"))
@@ -408,13 +398,3 @@ class DepthEngine:
             else config.iterations or self._iterations
         )
         return self.card.iterations_at_most(wanted)
-
-
-def _decoded_view(
-    decode: Callable[[], StereoFrame], stream: Stream
-) -> tuple[StereoFrame, StereoView]:
-    try:
-        frame = decode()
-        return frame, view_from_frame(frame, stream.rectifier, stream.config.axes)
-    except MemoryError:
-        raise out_of_memory() from None

@@ -137,6 +137,12 @@ class Stream:
         # Frames that were dropped while this one was in the model count for the next.
         self.frames_skipped -= frames_skipped
 
+    def note_answer(self, now_s: float, arrived_s: float, origin: Origin, model_s: float) -> None:
+        """Record a step for administrators."""
+        self.answers.append((now_s, now_s - arrived_s))
+        self.last_origin = origin
+        self.model_s += model_s
+
     def forget(self, reason: Origin) -> None:
         """Discard the state; the next step is cold."""
         self.state = None

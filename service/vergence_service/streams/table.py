@@ -1,6 +1,7 @@
 """The table of open streams: their owners, limits and expiry."""
 
 import hmac
+import logging
 import secrets
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -16,10 +17,12 @@ from vergence_proto.errors import (
     StreamExpired,
     StreamLimit,
     Superseded,
+    Unauthenticated,
     UnknownStream,
 )
 from vergence_proto.types import Origin, StereoRig, checked_stream_id
 from vergence_service.access.principals import LOCAL, Principal
+from vergence_service.logs import log_event
 from vergence_service.memory import MemoryBudget, MemoryHold, StreamMemory
 from vergence_service.metrics import Metrics
 from vergence_service.streams.rectify import Rectifier
@@ -31,6 +34,8 @@ from vergence_service.streams.stream import (
     StreamConfig,
     key_of,
 )
+
+log = logging.getLogger(__name__)
 
 # The server remembers for this long that a stream expired, and reports it as such.
 _TOMBSTONE_S = 300.0
@@ -195,6 +200,9 @@ class StreamTable:
         )
         self._streams[place.key] = stream
         self._metrics.streams_opened.inc()
+        self._metrics.openings.labels("opened").inc()
+        size = f"{config.rig.left.width}x{config.rig.left.height}"
+        log_event(log, "stream opened", **_about(stream), size=size)
         self._count()
         return stream
 
@@ -225,6 +233,8 @@ class StreamTable:
             stream.attachment.end(
                 Superseded(f"a newer connection attached to stream {stream_id!r}")
             )
+        self._metrics.openings.labels("resumed").inc()
+        log_event(log, "stream resumed", **_about(stream))
         stream.config = config
         stream.attachment = attachment
         stream.client = client  # the client may have changed its network
@@ -240,6 +250,8 @@ class StreamTable:
         if stream.attachment is attachment:
             stream.attachment = None
             self.touch(stream)
+            if self._streams.get(stream.key) is stream:
+                log_event(log, "stream detached", **_about(stream))
 
     def get(self, stream_id: str, *, owner: str = LOCAL.name) -> Stream:
         """Return an open stream of a principal.
@@ -277,11 +289,27 @@ class StreamTable:
         if self._streams.get(stream.key) is stream:
             del self._streams[stream.key]
             self._metrics.streams_closed.inc()
+            log_event(
+                log,
+                "stream closed",
+                **_about(stream),
+                stepped=stream.frames_stepped,
+                dropped=stream.frames_dropped,
+                failed=stream.frames_failed,
+            )
             stream.memory.release()
             if stream.attachment is not None:
                 self._leaving[stream.attachment] = _User(stream.owner.name, stream.client)
             self._count()
             self._on_closed(stream)
+
+    def end_those_of(self, gone: Callable[[Principal], bool]) -> None:
+        """End the streams of principals whose credential is gone."""
+        for stream in self:
+            if gone(stream.owner):
+                self.close(stream)
+                if stream.attachment is not None:
+                    stream.attachment.end(Unauthenticated("the token was removed"))
 
     def sweep(self) -> None:
         """Expire the streams that are due, warn those that will be soon, and lose silent clients.
@@ -313,6 +341,9 @@ class StreamTable:
         return 0.0 if _in_use(stream) else self._clock() - stream.active_s
 
     def _expire(self, stream: Stream) -> None:
+        why = "idle" if stream.attachment is not None else "detached"
+        self._metrics.streams_expired.labels(why).inc()
+        log_event(log, "stream expired", **_about(stream), why=why)
         self.close(stream)
         self._expired_s[stream.key] = self._clock()
         if stream.attachment is not None:
@@ -333,6 +364,15 @@ class StreamTable:
 
     def _count(self) -> None:
         self._metrics.streams_open.set(len(self._streams))
+
+
+def _about(stream: Stream) -> dict[str, object]:
+    return {
+        "stream": stream.stream_id,
+        "principal": stream.owner.name,
+        "transport": stream.transport,
+        "address": stream.client,
+    }
 
 
 def _in_use(stream: Stream) -> bool:

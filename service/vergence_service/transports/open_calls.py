@@ -4,12 +4,12 @@ import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
 
 from vergence_proto.codec import Request
-from vergence_proto.errors import Draining
+from vergence_proto.errors import DepthError, Draining
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.access.principals import Principal
 from vergence_service.memory import MemoryBudget
 from vergence_service.streams.engine import DepthEngine
-from vergence_service.transports.stream_call import DepthCall, StreamLimits
+from vergence_service.transports.stream_call import ClientLost, DepthCall, StreamLimits
 
 # A drain takes at most twice its time: once for clients to leave, and this share of it for the
 # answers to what they have sent. The rest is for the server to end.
@@ -65,9 +65,18 @@ class OpenCalls:
         self._running.add(call)
         self._engine.metrics.calls_open.inc()
         self._idle.clear()
+        reason = "left"  # the task was cancelled: the client is gone
         try:
             await call.run()
+            reason = "done"
+        except DepthError as error:
+            reason = error.code
+            raise
+        except ClientLost:
+            reason = "lost"
+            raise
         finally:
+            self._engine.metrics.calls_ended.labels(self._transport, reason).inc()
             self._running.discard(call)
             self._engine.metrics.calls_open.dec()
             if not self._running:

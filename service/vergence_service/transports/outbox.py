@@ -134,4 +134,5 @@ class Outbox:
         message.timings.CopyFrom(codec.timings_to_proto(timings))
         self._metrics.stage_s.labels("encode").observe(timings.encode_s)
         self._metrics.stage_s.labels("total").observe(timings.total_s)
+        self._metrics.frame_age_s.observe(timings.total_s)
         return response

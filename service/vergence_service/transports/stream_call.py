@@ -1,6 +1,7 @@
 """One StreamDepth call, on any transport: a reader, a stepper and a sender that overlap."""
 
 import asyncio
+import logging
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from vergence_proto.errors import DepthError, StreamExists, StreamExpired, Unkno
 from vergence_proto.types import Delivery
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.access.principals import Principal
+from vergence_service.logs import log_event
 from vergence_service.streams.conversion import SteppedFrame
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.stream import Notice, Stream, StreamConfig
@@ -19,6 +21,8 @@ from vergence_service.transports.displaced import DisplacedFrames
 from vergence_service.transports.mailbox import Mailbox, QueuedFrame
 from vergence_service.transports.outbox import Outbox
 from vergence_service.transports.unary import model_info
+
+log = logging.getLogger(__name__)
 
 # ``write_s`` is the time for answers up to this size. Larger ones have more time, in proportion.
 _USUAL_BYTES = 1 << 20
@@ -128,7 +132,19 @@ class DepthCall:
 
     async def run(self) -> None:
         """Serve the call to its end. Raises the DepthError that it ends with, or ClientLost."""
-        stream, resumed = await self._open()
+        try:
+            stream, resumed = await self._open()
+        except DepthError as error:
+            self._engine.metrics.openings.labels(error.code).inc()
+            log_event(
+                log,
+                "stream refused",
+                principal=self._caller.name,
+                transport=self._transport,
+                address=self._client,
+                reason=error.code,
+            )
+            raise
         self._stream = stream
         stream.transport = self._transport
         try:
