@@ -24,6 +24,8 @@ class Upload:
     jpeg_quality: int
     scale: int
     relative_bytes: float
+    share: float = 1.0
+    """Share of the limit on time that it may take."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +38,9 @@ class Download:
 
 # Best first. The bytes are those of a grey pair of 640x480, in kB; only their ratios matter. Half
 # size is better bought than quality below 50: at 18 kB its error is 0.69 px, that of JPEG 15 1.0.
+# JPEG 90 hardly helps, so it is for links on which it costs nothing.
 UPLOADS: tuple[Upload, ...] = (
-    Upload(90, 1, 93.0),
+    Upload(90, 1, 93.0, share=0.4),
     Upload(80, 1, 64.7),
     Upload(70, 1, 52.7),
     Upload(50, 1, 39.4),
@@ -131,9 +134,11 @@ class LinkController:
         downs_s = [each.relative_bytes * down_kb / down_rate for each in self._downloads]
         up_limit_s = min(_SHARE * camera_s, _UP_S)
         down_limit_s = min(_SHARE * camera_s, _DOWN_S)
+        up_limits_s = [each.share * up_limit_s for each in self._uploads]
+        down_limits_s = [down_limit_s] * len(self._downloads)
         calm = self._is_calm(now_s)
-        up = _next_rung(self._up, ups_s, up_limit_s, calm=calm, fresh=self._fresh)
-        down = _next_rung(self._down, downs_s, down_limit_s, calm=calm, fresh=self._fresh)
+        up = _next_rung(self._up, ups_s, up_limits_s, calm=calm, fresh=self._fresh)
+        down = _next_rung(self._down, downs_s, down_limits_s, calm=calm, fresh=self._fresh)
         if (up, down) != (self._up, self._down):
             self._calm_since_s = now_s
         self._up, self._down, self._fresh = up, down, False
@@ -170,12 +175,14 @@ class LinkController:
             self._headroom = min(self._headroom * (1 + _INCREASE_PER_S * elapsed_s), 1.0)
 
 
-def _next_rung(now: int, times_s: list[float], limit_s: float, *, calm: bool, fresh: bool) -> int:
+def _next_rung(
+    now: int, times_s: list[float], limits_s: list[float], *, calm: bool, fresh: bool
+) -> int:
     """Return the next rung: down as far as it must, up by one at a time."""
-    fitting = (rung for rung, time_s in enumerate(times_s) if time_s <= limit_s)
+    fitting = (rung for rung, time_s in enumerate(times_s) if time_s <= limits_s[rung])
     best = next(fitting, len(times_s) - 1)
-    if fresh or times_s[now] > _LEAVE * limit_s:
+    if fresh or times_s[now] > _LEAVE * limits_s[now]:
         return best
-    if calm and now > 0 and times_s[now - 1] <= _CLIMB * limit_s:
+    if calm and now > 0 and times_s[now - 1] <= _CLIMB * limits_s[now - 1]:
         return now - 1
     return now

@@ -15,6 +15,8 @@ _FRAMES_KEPT = 12
 _PINGS_KEPT = 40
 # Pings may wait behind frames, and their times vary. The lower quarter saw the way without a queue.
 _UNQUEUED_SHARE = 0.25
+# Over HTTP a ping is answered before the frame leaves: then it says nothing about the frame.
+_TOGETHER_NS = 2_000_000
 _LEAST_SERVICE_NS = 200_000  # a shorter time says nothing about a rate
 _S = 1e-9
 
@@ -115,7 +117,8 @@ class LinkMeter:
         received_ns = message.received_ns
         # In the order of time: its first byte could be at the server, was, and its last byte was.
         free_ns = sent.at_ns + _unqueued(self._pings_up_ns)
-        if sent.ping_ns in self._ping_received_ns:
+        near = sent.ping_ns is not None and sent.at_ns - sent.ping_ns < _TOGETHER_NS
+        if near and sent.ping_ns in self._ping_received_ns:
             free_ns = self._ping_received_ns[sent.ping_ns]
         started_ns = max(free_ns, self._last_received_ns)
         answered_ns = received_ns + message.timings.total_us * 1000

@@ -18,6 +18,9 @@ root; else it is a proxy that shapes the bytes (``"link": "proxy"``). Per link:
 ``--opens`` opens sessions over gRPC, HTTP and Zenoh (over TCP, without shared memory) instead:
 ``opened`` of ``tried`` at round trips of 60, 150 and 300 ms, and at 8 Mbit/s.
 
+``--ends`` ends 500 sessions over each transport while a frame is on its way, and counts the
+``errors`` that reach the program.
+
 ``--outages`` cuts the link for 3, 12, 20 and 60 s, kills the server, and changes the address of the
 client, in the middle of sessions over all three:
 
@@ -124,16 +127,17 @@ def server_of_all(place: Place, maps: str) -> "subprocess.Popen[str]":
     return process
 
 
-def opened(count: int) -> dict[str, Any]:
+def repeated(module: str, shapes: dict[str, LinkShape], count: int) -> dict[str, Any]:
+    """Run a module with each address of a server behind each link."""
     figures: dict[str, Any] = {}
-    for name, shape in OPENINGS.items():
+    for name, shape in shapes.items():
         figures[name] = {}
         with tun_link(shape) as link:
             place = Place(link.client, link.server, SERVER_IP)
             with server_of_all(place, "recall") as server:
                 for address in ADDRESSES:
                     plan = json.dumps({"server": address, "count": count})
-                    with python(place.client, "-m", "tests.support.link_openings", plan) as process:
+                    with python(place.client, "-m", module, plan) as process:
                         output, _ = process.communicate()
                     row = json.loads(output)
                     figures[name][address.partition(":")[0]] = row
@@ -247,10 +251,14 @@ def main() -> None:
         "--link", choices=("tun", "proxy"), default="tun" if can_make_links() else "proxy"
     )
     parser.add_argument("--opens", type=int, nargs="?", const=20, metavar="COUNT")
+    parser.add_argument("--ends", type=int, nargs="?", const=500, metavar="COUNT")
     parser.add_argument("--outages", nargs="*", choices=OUTAGES)
     args = parser.parse_args()
     if args.opens:
-        figures = opened(args.opens)
+        figures = repeated("tests.support.link_openings", OPENINGS, args.opens)
+    elif args.ends:
+        shapes = {"20 Mbit/s": LINKS["20"]}
+        figures = repeated("tests.support.link_endings", shapes, args.ends)
     elif args.outages is not None:
         figures = outages(args.outages or OUTAGES)
     else:
