@@ -3,6 +3,12 @@
 #define VERGENCE_AMBIGUITY_H
 #include "search.h"
 
+#if defined(__GNUC__)
+#define NOINLINE __attribute__((noinline)) /* inlined, `restrict` is forgotten */
+#else
+#define NOINLINE
+#endif
+
 /* Rows of measures, in the order of the network's inputs. */
 enum { SPREAD_SOFT, SPREAD_SHARP, TOP, BELOW_TOP, LEAD, BEYOND, ANSWER, LOG_SIGMA, SPREAD_AROUND, TOP_AROUND,
        SPREAD_FAR, TOP_FAR };
@@ -11,17 +17,41 @@ static inline float *measure_row(const Workspace *k, int measure, int y) {
     return k->measures + ((ptrdiff_t)measure * k->h8 + y) * k->p8;
 }
 
+/* The best and the sum of a row's scores. `restrict` lets the compiler use vectors. */
+static NOINLINE void add_to_top(const float *restrict score, int n, float *restrict top, float *restrict sum) {
+    for (int x = 0; x < n; x++) {
+        top[x] = most(score[x], top[x]);
+        sum[x] += score[x];
+    }
+}
+
+/* What scores of one disparity add: its share, soft and sharp, and that times the distance from the answer;
+   the best score near the answer, and the best elsewhere. */
+static NOINLINE void add_to_spread(const float *restrict score, float bin_px, int n, const float *restrict answer,
+                                   const float *restrict top, float *restrict own, float *restrict rival,
+                                   float *restrict soft_sum, float *restrict sharp_sum, float *restrict soft_px,
+                                   float *restrict sharp_px) {
+    for (int x = 0; x < n; x++) {
+        const float v = score[x], apart = fabsf(bin_px - answer[x]), beside = most(apart - 6.0f, 0.0f);
+        const float near = apart <= 6.0f ? 1000.0f : 0.0f;
+        const float soft = own_exp((v - top[x]) * 0.25f), square = soft * soft, sharp = square * square;
+        own[x] = most(v + near, own[x]);
+        rival[x] = most(v - near, rival[x]);
+        soft_sum[x] += soft;
+        sharp_sum[x] += sharp;
+        soft_px[x] += soft * beside;
+        sharp_px[x] += sharp * beside;
+    }
+}
+
 /* Measures of the scores of a row round its answer; the refinement's doubt becomes its sigma. */
 static void ambiguity_row(void *context, int y, int worker) {
     Step *s = context;
     const Workspace *k = s->space;
     const float *sigma = s->model->end.sigma;
     const int w = k->w8, p8 = k->p8;
-    float *d = (float *)scratch(s, worker), *top = d + p8, *own = top + p8, *rival = own + p8;
-    float *mean = rival + p8;
-    float *sums[4]; /* of soft shares, of sharp ones, and of each times its distance from the answer */
-    for (int i = 0; i < 4; i++)
-        sums[i] = mean + (i + 1) * p8;
+    float *d = (float *)scratch(s, worker), *top = d + p8, *sum = top + p8, *own = sum + p8, *rival = own + p8;
+    float *soft = rival + p8, *sharp = soft + p8, *soft_far = sharp + p8, *sharp_far = soft_far + p8;
     const float *a = k->d4 + (ptrdiff_t)2 * y * k->p4, *b = a + k->p4;
     float *raw_a = k->doubt + (ptrdiff_t)2 * y * k->p4, *raw_b = raw_a + k->p4;
     for (int x = 0; x < k->w4; x++) {
@@ -29,45 +59,30 @@ static void ambiguity_row(void *context, int y, int worker) {
         raw_b[x] = own_exp(clamped(raw_b[x] * sigma[0], sigma[1], sigma[2])) * sigma[3];
     }
     const float *score = k->fixed + (ptrdiff_t)y * BINS * p8;
-    memcpy(top, score, sizeof(float) * (size_t)w);
     for (int x = 0; x < w; x++) {
         d[x] = ((a[2 * x] + a[2 * x + 1]) + (b[2 * x] + b[2 * x + 1])) * 0.25f;
+        top[x] = sum[x] = score[x];
         own[x] = rival[x] = -3.0e38f;
-        mean[x] = score[x];
-        sums[0][x] = sums[1][x] = sums[2][x] = sums[3][x] = 0.0f;
+        soft[x] = sharp[x] = soft_far[x] = sharp_far[x] = 0.0f;
     }
     for (int i = 1; i < BINS; i++)
-        for (int x = 0; x < w; x++) {
-            top[x] = most(score[i * p8 + x], top[x]);
-            mean[x] += score[i * p8 + x];
-        }
-    for (int i = 0; i < BINS; i++) {
-        const float bin_px = (float)((BINS - 1 - i) * 4);
-        const float *v = score + i * p8;
-        for (int x = 0; x < w; x++) {
-            float apart = fabsf(bin_px - d[x]), beside = most(apart - 6.0f, 0.0f);
-            float near = apart <= 6.0f ? 1000.0f : 0.0f;
-            float soft = own_exp((v[x] - top[x]) * 0.25f), sharp = soft * soft;
-            sharp = sharp * sharp;
-            own[x] = most(v[x] + near, own[x]);
-            rival[x] = most(v[x] - near, rival[x]);
-            sums[0][x] += soft;
-            sums[1][x] += sharp;
-            sums[2][x] += soft * beside;
-            sums[3][x] += sharp * beside;
-        }
-    }
+        add_to_top(score + i * p8, w, top, sum);
+    for (int i = 0; i < BINS; i++)
+        add_to_spread(score + i * p8, (float)((BINS - 1 - i) * 4), w, d, top, own, rival, soft, sharp, soft_far,
+                      sharp_far);
     float *soft_px = measure_row(k, SPREAD_SOFT, y), *sharp_px = measure_row(k, SPREAD_SHARP, y);
     float *best = measure_row(k, TOP, y), *below = measure_row(k, BELOW_TOP, y), *lead = measure_row(k, LEAD, y);
     float *outside = measure_row(k, BEYOND, y), *answer = measure_row(k, ANSWER, y);
     float *log_sigma = measure_row(k, LOG_SIGMA, y);
     for (int x = 0; x < w; x++) {
         const float of_own = own[x] - 1000.0f;
-        soft_px[x] = own_log(sums[2][x] / sums[0][x] + 1.0f);
-        sharp_px[x] = own_log(sums[3][x] / sums[1][x] + 1.0f);
-        best[x] = (top[x] - mean[x] * (1.0f / BINS)) * 0.1f;
+        soft_px[x] = own_log(soft_far[x] / soft[x] + 1.0f);
+        sharp_px[x] = own_log(sharp_far[x] / sharp[x] + 1.0f);
+        best[x] = (top[x] - sum[x] * (1.0f / BINS)) * 0.1f;
         below[x] = least((top[x] - of_own) * 0.1f, 4.0f);
         lead[x] = clamped((of_own - rival[x]) * 0.1f, -2.0f, 2.0f);
+    }
+    for (int x = 0; x < w; x++) {
         outside[x] = clamped((d[x] - ((float)x * 8.0f + 3.5f)) * 0.125f, -1.0f, 1.0f);
         answer[x] = d[x] * 0.015625f;
         log_sigma[x] = own_log(((raw_a[2 * x] + raw_a[2 * x + 1]) + (raw_b[2 * x] + raw_b[2 * x + 1])) * 0.25f);
