@@ -218,6 +218,12 @@ async def test_a_principal_that_has_its_share_leaves_room_to_others(guarded: Gua
             await RawCall(calls.StreamDepth(metadata=as_ana)).ask(open_message())
         assert reason_over_grpc(refusal.value) == "QUOTA"
         assert "close one" in (refusal.value.details() or "")
+        dear = open_message()
+        dear.open.cold_iterations = 64
+        with pytest.raises(grpc.aio.AioRpcError) as refusal:
+            await RawCall(calls.StreamDepth(metadata=as_ben)).ask(dear)
+        assert reason_over_grpc(refusal.value) == "QUOTA"
+        assert "limits.iterations" in (refusal.value.details() or "")
         kept.append(RawCall(calls.StreamDepth(metadata=as_ben)))
         await kept[-1].ask(open_message())
         for call in kept:

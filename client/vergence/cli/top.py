@@ -47,7 +47,7 @@ async def _streams(http: httpx.AsyncClient) -> list[dict[str, Any]]:
 
 
 def _table(streams: list[dict[str, Any]]) -> Table:
-    table = Table(title=f"{len(streams)} open streams", title_justify="left")
+    table = Table(title=f"open streams: {len(streams)}", title_justify="left")
     for index, name in enumerate(_COLUMNS):
         table.add_column(name, justify="left" if index < 3 else "right")
     for each in streams:

@@ -166,6 +166,7 @@ async def running(
         max_frame_bytes=max_frame_bytes,
         silent_s=settings.limits.silent_s,
         write_s=settings.limits.write_s,
+        iterations=settings.limits.iterations,
     )
     unary = UnaryMethods(
         engine,

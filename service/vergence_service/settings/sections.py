@@ -191,6 +191,9 @@ class LimitSettings(Section):
     streams: PositiveInt = Field(
         default=4, description="most open streams of one principal; a token may allow others"
     )
+    iterations: PositiveInt = Field(
+        default=8, description="most iterations of a step that one principal may ask for"
+    )
     waiting_sequences: PositiveInt = Field(
         default=8, description="most unfinished sequences of one principal"
     )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from vergence_proto import codec
-from vergence_proto.errors import DepthError, StreamExists, StreamExpired, UnknownStream
+from vergence_proto.errors import DepthError, Quota, StreamExists, StreamExpired, UnknownStream
 from vergence_proto.types import Delivery
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.access.principals import Principal
@@ -39,6 +39,7 @@ class StreamLimits:
     max_frame_bytes: int
     silent_s: float  # a client that pinged and sends nothing for this long counts as lost
     write_s: float  # so does a client that does not read an answer for this long
+    iterations: int  # most that a principal with a credential may ask for
 
 
 class ClientLost(Exception):
@@ -209,6 +210,12 @@ class DepthCall:
             weights_sha256=request.weights_sha256,
             opening_id=request.opening_id,
         )
+        asked = max(config.iterations, config.cold_iterations)
+        if self._caller.proven and asked > self._limits.iterations:
+            raise Quota(
+                f"expected at most {self._limits.iterations} iterations of one principal, got "
+                f"{asked}; ask for fewer (the server's setting limits.iterations)"
+            )
         if request.resume_token:
             resumed = self._engine.resume(
                 request.stream_id,
