@@ -158,7 +158,14 @@ FACES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", FACES)
+# Proofs of `lite` take seconds; CI has time for all four.
+_QUICK = ("negative", "half-size twin")
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [kind if kind in _QUICK else pytest.param(kind, marks=pytest.mark.slow) for kind in FACES],
+)
 def test_lite_behind_a_foreign_face_gives_the_bits_of_lite(kind: str, tmp_path: Path) -> None:
     face = FACES[kind]
     card = load_model_card(WEIGHTS, "lite")
