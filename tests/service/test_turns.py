@@ -124,12 +124,12 @@ async def test_a_stream_takes_its_newest_frame_when_it_has_a_turn() -> None:
         raw_stream(server, "three", every=False) as three,
     ):
         with model.busy():
-            # One is in the model, and one is decoded ahead. The third waits for its turn.
-            for call in (one, two):
-                await call.send(frame_message(make_frame(1)))
+            # One is in the model. The others wait for their turns.
+            await one.send(frame_message(make_frame(1)))
             await asyncio.to_thread(model.wait_until_entered)
+            await two.send(frame_message(make_frame(1)))
             await three.send(frame_message(make_frame(1)))
-            await eventually(lambda: len(server.engine.turns) == 1)
+            await eventually(lambda: len(server.engine.turns) == 2)
             for frame_id in range(2, 6):
                 await three.send(frame_message(make_frame(frame_id)))
             stream = server.engine.streams.get("three")

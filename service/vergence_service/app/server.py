@@ -110,10 +110,11 @@ async def running(
     batcher = StepBatcher(
         model, max_batch=settings.model.max_batch, memory=memory, clock=clock, metrics=metrics
     )
-    # One more than the model takes at once, decoded ahead, so that no lane waits.
+    # As many as the model takes at once. One more, decoded ahead, halved what a stream got beside
+    # one with large images. A batch needs the next batch to wait already.
     at_once = max(model.max_concurrent_steps, settings.model.max_batch)
     turns = Turns(
-        places=2 * at_once if settings.model.max_batch > 1 else at_once + 1,
+        places=2 * at_once if settings.model.max_batch > 1 else at_once,
         lanes=model.max_concurrent_steps,
         clock=clock,
     )
