@@ -1,10 +1,12 @@
 """Over a real Zenoh router, processes die, fall silent and lose messages; sessions recover."""
 
 import asyncio
+import itertools
 import os
 import signal
 import sys
 from contextlib import AsyncExitStack
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -74,6 +76,15 @@ async def test_a_lossless_stream_outlives_its_router_and_loses_nothing() -> None
     assert session.drops.total == 0
 
 
+@pytest.fixture
+def place(monkeypatch: pytest.MonkeyPatch) -> str:
+    """Return the secret chunk in the keys of the first attachment; no wildcard matches it."""
+    ids = (f"{number:032x}" for number in itertools.count(1))
+    choice = SimpleNamespace(token_hex=lambda _: next(ids))
+    monkeypatch.setattr("vergence.transports.zenoh_call.secrets", choice)
+    return f"@{1:032x}"
+
+
 def only(messages: str, key: str, size: int) -> dict[str, Any]:
     """A router that lets only messages of at most ``size`` bytes pass on a key."""
     return {
@@ -85,9 +96,11 @@ def only(messages: str, key: str, size: int) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("way", ["frames", "disparity"])
-async def test_what_the_network_loses_is_found_out_and_gives_its_credit_back(way: str) -> None:
+async def test_what_the_network_loses_is_found_out_and_gives_its_credit_back(
+    way: str, place: str
+) -> None:
     # A router that lets no image pass, but everything small.
-    lossy = router(low_pass_filter=[only("put", f"vergence/v1/*/{way}", 2000)])
+    lossy = router(low_pass_filter=[only("put", f"vergence/v1/{place}/*/{way}", 2000)])
     async with (
         lossy as between,
         server_on(between.endpoint) as server,
@@ -183,11 +196,11 @@ async def test_a_server_that_shuts_down_says_so() -> None:
     assert [event.kind for event in events] == [EventKind.DRAINING]
 
 
-async def test_a_server_that_falls_silent_is_left() -> None:
+async def test_a_server_that_falls_silent_is_left(place: str) -> None:
     events: list[SessionEvent] = []
     # Tokens and queries pass the router, and nothing else.
     async with (
-        router(low_pass_filter=[only("put", "vergence/v1/*/status", 0)]) as between,
+        router(low_pass_filter=[only("put", f"vergence/v1/{place}/*/status", 0)]) as between,
         server_on(between.endpoint),
         DepthClient(between.address) as client,
         client.open_session(RIG, on_event=events.append),
