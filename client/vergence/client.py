@@ -205,6 +205,7 @@ class DepthClient:
             iterations=iterations,
             cold_iterations=cold_iterations,
             weights_sha256=weights_sha256,
+            paces=adapts,
         )
         session = DepthSession(
             SessionSetup(

@@ -142,7 +142,7 @@ class StreamDepthResponse(_message.Message):
     def __init__(self, opened: _Optional[_Union[StreamOpened, _Mapping[str, _Any]]] = ..., disparity: _Optional[_Union[DisparityMap, _Mapping[str, _Any]]] = ..., frame_error: _Optional[_Union[FrameError, _Mapping[str, _Any]]] = ..., frames_dropped: _Optional[_Union[FramesDropped, _Mapping[str, _Any]]] = ..., pong: _Optional[_Union[Pong, _Mapping[str, _Any]]] = ..., notice: _Optional[_Union[Notice, _Mapping[str, _Any]]] = ...) -> None: ...
 
 class OpenStream(_message.Message):
-    __slots__ = ("stream_id", "resume_token", "rig", "axes", "delivery", "output", "iterations", "cold_iterations", "weights_sha256", "opening_id")
+    __slots__ = ("stream_id", "resume_token", "rig", "axes", "delivery", "output", "iterations", "cold_iterations", "weights_sha256", "opening_id", "paces")
     STREAM_ID_FIELD_NUMBER: _ClassVar[int]
     RESUME_TOKEN_FIELD_NUMBER: _ClassVar[int]
     RIG_FIELD_NUMBER: _ClassVar[int]
@@ -153,6 +153,7 @@ class OpenStream(_message.Message):
     COLD_ITERATIONS_FIELD_NUMBER: _ClassVar[int]
     WEIGHTS_SHA256_FIELD_NUMBER: _ClassVar[int]
     OPENING_ID_FIELD_NUMBER: _ClassVar[int]
+    PACES_FIELD_NUMBER: _ClassVar[int]
     stream_id: str
     resume_token: bytes
     rig: StereoRig
@@ -163,7 +164,8 @@ class OpenStream(_message.Message):
     cold_iterations: int
     weights_sha256: str
     opening_id: bytes
-    def __init__(self, stream_id: _Optional[str] = ..., resume_token: _Optional[bytes] = ..., rig: _Optional[_Union[StereoRig, _Mapping[str, _Any]]] = ..., axes: _Optional[_Union[Axes, str]] = ..., delivery: _Optional[_Union[Delivery, str]] = ..., output: _Optional[_Union[OutputFormat, _Mapping[str, _Any]]] = ..., iterations: _Optional[int] = ..., cold_iterations: _Optional[int] = ..., weights_sha256: _Optional[str] = ..., opening_id: _Optional[bytes] = ...) -> None: ...
+    paces: bool
+    def __init__(self, stream_id: _Optional[str] = ..., resume_token: _Optional[bytes] = ..., rig: _Optional[_Union[StereoRig, _Mapping[str, _Any]]] = ..., axes: _Optional[_Union[Axes, str]] = ..., delivery: _Optional[_Union[Delivery, str]] = ..., output: _Optional[_Union[OutputFormat, _Mapping[str, _Any]]] = ..., iterations: _Optional[int] = ..., cold_iterations: _Optional[int] = ..., weights_sha256: _Optional[str] = ..., opening_id: _Optional[bytes] = ..., paces: bool = ...) -> None: ...
 
 class StreamOpened(_message.Message):
     __slots__ = ("stream_id", "resume_token", "credit", "rig", "model", "resumed", "detach_grace_s", "idle_timeout_s", "last_frame_id", "silent_s", "max_frame_scale", "paced_credit", "left_from_rectified")

@@ -85,6 +85,7 @@ class DepthCall:
         self._pings = False  # the client has pinged, so its silence says that it is lost
         self._owed = 0  # frames that have no answer yet
         self._heard_s = clock()  # time of the last message, or of the answer that it waited for
+        self._paces = False
         self._overran = False  # the client has sent more frames than its credit allows
         self._lost: asyncio.Future[ClientLost] = asyncio.get_running_loop().create_future()
         self._detached = asyncio.Event()
@@ -198,7 +199,9 @@ class DepthCall:
 
     async def _open(self) -> tuple[Stream, bool]:
         request = await anext(aiter(self._requests), None)
-        if not isinstance(request, pb.OpenStream):
+        if isinstance(request, pb.OpenStream):
+            self._paces = request.paces and request.delivery != pb.DELIVERY_EVERY
+        else:
             raise UnknownStream("the first message of a call must open or resume a stream")
         config = StreamConfig(
             rig=codec.rig_from_proto(request.rig),
@@ -248,7 +251,7 @@ class DepthCall:
             last_frame_id=stream.last_frame_id,
             silent_s=self._limits.silent_s,
             max_frame_scale=codec.MAX_FRAME_SCALE,
-            paced_credit=self._most_unanswered(stream),
+            paced_credit=self._limits.paced_credit if self._paces else 0,
             left_from_rectified=(
                 None
                 if stream.rectifier.maps is None
@@ -256,9 +259,9 @@ class DepthCall:
             ),
         )
 
-    def _most_unanswered(self, stream: Stream) -> int:
-        live = stream.config.delivery is Delivery.NEWEST
-        return self._limits.paced_credit if live else self._limits.credit
+    @property
+    def _most_unanswered(self) -> int:
+        return self._limits.paced_credit if self._paces else self._limits.credit
 
     async def _read(self, stream: Stream, mailbox: Mailbox) -> None:
         try:
@@ -286,7 +289,7 @@ class DepthCall:
         self, stream: Stream, mailbox: Mailbox, frame: codec.ReceivedFrame, arrived_s: float
     ) -> None:
         self._owed += 1
-        self._overran = self._overran or self._owed > self._most_unanswered(stream)
+        self._overran = self._overran or self._owed > self._most_unanswered
         rig = stream.rectifier.rig
         try:
             codec.check_frame(

@@ -48,6 +48,7 @@ class ZenohCall:
         self._calls = calls
         self._caller = caller
         self._live = opening.delivery != pb.DELIVERY_EVERY
+        self._paces = opening.paces and self._live
         self._call = calls.make(self._requests(), self._write, client="", caller=caller)
         self._inbox = Inbox(
             attachment_id,
@@ -97,7 +98,7 @@ class ZenohCall:
         if last is not None:
             # No more frames of a client wait for an answer, so no more can be missing.
             limits = self._calls.limits
-            most = limits.paced_credit if self._live else limits.credit
+            most = limits.paced_credit if self._paces else limits.credit
             oldest = max(last + 1, frame_id - most)
             await self._call.report_lost(range(oldest, frame_id))
         self._last_frame_id = frame_id
