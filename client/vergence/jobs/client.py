@@ -13,6 +13,7 @@ from vergence.jobs.frames import BatchFrame
 from vergence.jobs.info import JobInfo
 from vergence.jobs.packing import Upload, upload_of
 from vergence.jobs.requests import Query, Requests
+from vergence.jobs.resumable import send_resumably
 from vergence.jobs.saving import Saving, checked_format, make_room
 from vergence.transports.addresses import is_private
 from vergence.transports.credentials import Credentials
@@ -146,19 +147,13 @@ class AsyncBatchClient:
 
     async def send(self, upload: Upload, query: Query) -> "AsyncBatchJob":
         """Upload what was found before, with the options of the HTTP API."""
-        size = await asyncio.to_thread(upload.size)
-        headers = {
-            "Content-Type": "application/octet-stream",
-            "Content-Length": str(size),
-            "Idempotency-Key": f'"{secrets.token_hex(16)}"',
-        }
+        upload_id = await send_resumably(self._requests, upload)
         source = {} if upload.source is None else {"source": upload.source}
         answer = await self._requests.ask(
             "POST",
             _SEQUENCES,
-            query={**query, **source},
-            headers=headers,
-            body=upload.chunks,
+            query={**query, **source, "upload": upload_id},
+            headers={"Idempotency-Key": f'"{secrets.token_hex(16)}"'},
             when_full=True,
         )
         return AsyncBatchJob(self._requests, JobInfo.from_json(answer.json()))

@@ -9,7 +9,7 @@ from vergence.transports.addresses import on_this_machine
 from vergence.transports.base import ConnectionLost
 from vergence.transports.credentials import Credentials
 from vergence.transports.proxies import through_proxy
-from vergence_proto.errors import error_from_wire
+from vergence_proto.errors import UnknownSequence, error_from_wire
 from vergence_proto.extras import how_to_install
 
 if TYPE_CHECKING:  # an extra
@@ -95,6 +95,13 @@ class Requests:
                 continue
             return checked(answer)
 
+    async def once(
+        self, method: str, path: str, *, headers: Mapping[str, str], body: AsyncIterator[bytes]
+    ) -> "httpx.Response":
+        """Send a request that must not be repeated as it is. Raises what httpx does."""
+        content = self._counted(body)
+        return checked(await self._http.request(method, path, headers=headers, content=content))
+
     async def stream(
         self, path: str, *, query: Query, headers: Mapping[str, str]
     ) -> "AsyncIterator[httpx.Response]":
@@ -104,7 +111,7 @@ class Requests:
 
     async def patiently(self, ask: Callable[[], Awaitable[Any]]) -> Any:
         """Repeat ``ask`` while the connection is lost. Raises ConnectionLost."""
-        self.moved()
+        self.moved()  # patience begins with the first attempt
         while True:
             try:
                 answer = await ask()
@@ -133,4 +140,6 @@ def checked(answer: "httpx.Response") -> "httpx.Response":
         problem = answer.json()
         if "reason" in problem:
             raise error_from_wire(problem["reason"], problem["detail"])
+    if answer.request.method == "HEAD" and answer.status_code == 404:  # it has no body
+        raise UnknownSequence(f"{answer.url.path} is not there, or no longer")
     raise ConnectionLost(f"{answer.url} answered {answer.status_code}: is it a Vergence server?")

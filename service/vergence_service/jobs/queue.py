@@ -14,6 +14,7 @@ from vergence_proto.jobs import OnError
 from vergence_service.access.principals import LOCAL, Principal
 from vergence_service.jobs.forecast import forecast
 from vergence_service.jobs.job import Job, JobOptions
+from vergence_service.jobs.kept_uploads import KeptUploads
 from vergence_service.jobs.progress import JobStatus
 from vergence_service.jobs.registry import JobRegistry
 from vergence_service.jobs.results import read_records, result_bytes
@@ -68,6 +69,7 @@ class JobQueue:
             disk_bytes=limits.disk_bytes,
             background=self.threads,
         )
+        self.uploads = KeptUploads(store.directory / "uploads", keep_s=limits.keep_s)
         self._engine = engine
         self._store = store
         self._limits = limits
@@ -77,6 +79,7 @@ class JobQueue:
 
     async def __aenter__(self) -> Self:
         await self.jobs.load()
+        await self.threads.run(self.uploads.expire)
         return self
 
     async def __aexit__(self, *exc_info: object) -> None:

@@ -48,6 +48,11 @@ class SubmitQuery(BaseModel):
         description="the sequence as KIND:PATH in the archive, for example vergence:room or "
         "kitti:sequences/00; needed if the archive contains several",
     )
+    upload: str | None = Field(
+        default=None,
+        max_length=64,
+        description="id of a complete upload of /v1/uploads, in place of a body",
+    )
     model: str | None = Field(default=None, description="refuse unless the server runs this model")
     iterations: int = Field(
         default=0, ge=0, le=64, description="iterations of every step; 0: the default"

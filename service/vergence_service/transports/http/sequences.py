@@ -28,12 +28,14 @@ from vergence_service.transports.http.frame_routes import frame_routes
 from vergence_service.transports.http.idempotency import KeysInUse, Submission, check_digest
 from vergence_service.transports.http.pages import ListQuery
 from vergence_service.transports.http.sequence_models import ResultQuery, SequenceJob, SubmitQuery
+from vergence_service.transports.http.tus import tus_routes
 from vergence_service.transports.http.uploads import (
     ARCHIVE_TYPES,
     FORM_TYPE,
     UploadLimits,
     client_of,
     digest_of,
+    receive_kept,
     receive_sequence,
     while_connected,
 )
@@ -123,12 +125,18 @@ def sequence_routes(
                 async with queue.upload_folder(
                     client, upload_bytes=upload_bytes, owner=caller
                 ) as folder:
-                    digest = await receive_sequence(request, folder, limits, threads)
+                    if query.upload is None:
+                        digest = await receive_sequence(request, folder, limits, threads)
+                    else:
+                        kept = await threads.run(queue.uploads.get, query.upload, caller)
+                        digest = await receive_kept(request, kept, folder, limits, threads)
                     check_digest(submission.body_sha256, digest)
                     async with while_connected(request):
                         status = await queue.accept(
                             folder, order, upload_sha256=digest, client=client, owner=caller
                         )
+                    if query.upload is not None:
+                        await threads.run(queue.uploads.delete, query.upload)
         job_id = status.job.job_id
         if query.wait:
             while not (status := jobs.status(job_id)).job.ended and not stopping.is_set():
@@ -223,6 +231,7 @@ def sequence_routes(
         await queue.delete(job_id)
 
     router.include_router(frame_routes(jobs, threads, stopping))
+    router.include_router(tus_routes(queue, queue.uploads, limits))
     return router
 
 
@@ -251,7 +260,7 @@ async def _check_repeated(
 ) -> None:
     """Raise KeyReused unless the request is the one that ``earlier`` was submitted by."""
     submission.check(earlier, submission.body_sha256)
-    if submission.body_sha256 is None:
+    if submission.body_sha256 is None and "upload" not in request.query_params:
         submission.check(earlier, await digest_of(request, limits, threads))
 
 

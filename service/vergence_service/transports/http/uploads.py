@@ -7,6 +7,7 @@ leaves files only in the folder that the caller provides and removes.
 import asyncio
 import hashlib
 import json
+import os
 from collections.abc import AsyncIterator, Iterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from vergence_proto.codec.image_files import ImageKind, image_kind
 from vergence_proto.errors import BadSequence, UploadTooLarge
 from vergence_proto.text import decoded_text
 from vergence_service.jobs.archives import ArchiveLimits, unpacking
+from vergence_service.jobs.kept_uploads import KeptUpload
 from vergence_service.threads import ThreadPool
 from vergence_service.transports.http.bodies import body_of
 from vergence_service.transports.http.forms import FormPart, FormWriter
@@ -36,6 +38,7 @@ ARCHIVE_TYPES = (
     "application/x-bzip2",
     "application/octet-stream",
 )
+_DIGESTED = 1 << 20
 _LARGEST_JSON = 8 << 20  # its numbers take a dozen times the memory
 _EXTENSIONS = {ImageKind.PNG: "png", ImageKind.JPEG: "jpg", ImageKind.WEBP: "webp"}
 
@@ -162,6 +165,33 @@ async def receive_sequence(
             f"expected a body of {FORM_TYPE} or {', '.join(ARCHIVE_TYPES)}, got {kind!r}"
         )
     return digest.hexdigest()
+
+
+async def receive_kept(
+    request: Request, upload: KeptUpload, folder: Path, limits: UploadLimits, threads: ThreadPool
+) -> str:
+    """Unpack an upload that has arrived in parts to ``folder``/input; it stays where it is.
+
+    Returns its SHA-256. Raises BadSequence if it is not complete or no archive, and UploadTooLarge
+    if it exceeds a limit.
+    """
+    if upload.offset != upload.length:
+        raise BadSequence(
+            f"the upload has {upload.offset} of {upload.length} bytes; send the rest first"
+        )
+    archive, digest = folder / "archive", hashlib.sha256()
+    await threads.run(os.link, upload.path, archive)
+    async with while_connected(request):
+        await threads.finish(_digesting(archive, digest))
+        await threads.finish(_unpacking(archive, folder, limits))
+    return digest.hexdigest()
+
+
+def _digesting(path: Path, digest: "hashlib._Hash") -> Iterator[None]:
+    with path.open("rb") as file:
+        while chunk := file.read(_DIGESTED):
+            digest.update(chunk)
+            yield
 
 
 async def digest_of(request: Request, limits: UploadLimits, threads: ThreadPool) -> str:

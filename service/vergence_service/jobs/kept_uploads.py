@@ -1,0 +1,87 @@
+"""Uploads that arrive in parts, on disk: they survive lost connections and restarts.
+
+::
+
+    DIRECTORY/uploads/ID/body        what has arrived
+    DIRECTORY/uploads/ID/about.json  the length that was announced, and the owner
+"""
+
+import json
+import secrets
+import shutil
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from vergence_proto.errors import UnknownSequence
+from vergence_service.access.principals import Principal
+
+_BODY, _ABOUT = "body", "about.json"
+
+
+@dataclass(frozen=True, slots=True)
+class KeptUpload:
+    """An upload, complete or not."""
+
+    upload_id: str
+    path: Path  # of its bytes
+    length: int  # bytes that were announced
+    offset: int  # bytes that have arrived
+    expires_s: float  # Unix time
+
+
+class KeptUploads:
+    """The uploads of one server. All methods block; any thread may call them."""
+
+    def __init__(self, directory: Path, *, keep_s: float) -> None:
+        self._directory = directory
+        self._keep_s = keep_s
+
+    def create(self, owner: Principal, length: int) -> KeptUpload:
+        """Make an empty upload of ``length`` bytes."""
+        self.expire()
+        folder = self._directory / secrets.token_hex(16)
+        folder.mkdir(parents=True, mode=0o700)
+        (folder / _BODY).touch()
+        (folder / _ABOUT).write_text(json.dumps({"length": length, "owner": owner.name}))
+        return self._read(folder)
+
+    def get(self, upload_id: str, caller: Principal) -> KeptUpload:
+        """Return an upload of the caller. Raises UnknownSequence: there is none, or no longer."""
+        folder = self._directory / upload_id
+        try:
+            if upload_id.isalnum() and caller.owns(
+                json.loads((folder / _ABOUT).read_text())["owner"]
+            ):
+                upload = self._read(folder)
+                if upload.expires_s > time.time():
+                    return upload
+        except (OSError, ValueError, KeyError):
+            pass
+        raise UnknownSequence(
+            f"no upload {upload_id[:64]!r}: it never existed, was deleted or submitted, or expired"
+        )
+
+    def delete(self, upload_id: str) -> None:
+        """Delete an upload that exists."""
+        shutil.rmtree(self._directory / upload_id, ignore_errors=True)
+
+    def expire(self) -> None:
+        """Delete the uploads to which nothing was added for too long."""
+        for folder in self._directory.iterdir() if self._directory.is_dir() else ():
+            try:
+                gone = self._read(folder).expires_s <= time.time()
+            except (OSError, ValueError, KeyError):  # a crash while it was made
+                gone = True
+            if gone:
+                shutil.rmtree(folder, ignore_errors=True)
+
+    def _read(self, folder: Path) -> KeptUpload:
+        body = (folder / _BODY).stat()
+        return KeptUpload(
+            folder.name,
+            folder / _BODY,
+            int(json.loads((folder / _ABOUT).read_text())["length"]),
+            body.st_size,
+            body.st_mtime + self._keep_s,
+        )
