@@ -11,6 +11,7 @@ import pytest
 
 from tests.support.http import disparities, ended, http_server, http_to, reason_of, submit
 from tests.support.models import RecallModel
+from tests.support.polling import eventually
 from tests.support.sequences import make_frames, sequence_files, write_sequence, zip_bytes
 from tests.support.server import running_server
 from tests.support.tokens import TokenFile, http_as
@@ -101,26 +102,26 @@ async def test_the_upload_of_another_is_unknown(tmp_path: Path) -> None:
         assert (await ana.head(url)).status_code == 200
 
 
-async def test_a_request_that_hangs_is_replaced_by_the_next() -> None:
-    async with running_server(RecallModel()) as server, http_to(server) as client:
+async def test_a_request_that_hangs_is_replaced_by_the_next(tmp_path: Path) -> None:
+    async with (
+        running_server(RecallModel(), batch__directory=tmp_path) as server,
+        http_to(server) as client,
+    ):
         url = await announced(client)
         _, writer = await asyncio.open_connection(*server.http_address.split(":"))
         head = (
             f"PATCH {url} HTTP/1.1\r\nHost: {server.http_address}\r\nUpload-Offset: 0\r\n"
             f"Content-Type: {PART['Content-Type']}\r\nContent-Length: {len(ARCHIVE)}\r\n\r\n"
         )
-        writer.write(head.encode() + ARCHIVE[:500])
-        await writer.drain()
-        offset = 0
-        while offset < 500:  # until all of it has arrived
-            state = await client.head(url)
-            offset = int(state.headers["Upload-Offset"])
-            assert offset <= 500
-            if offset == 0:
-                continue
-            break
-        assert (await send(client, url, offset, ARCHIVE[offset:])).status_code == 204
-        writer.close()
+        try:
+            writer.write(head.encode() + ARCHIVE[:500])
+            await writer.drain()
+            [body] = tmp_path.glob("uploads/*/body")
+            await eventually(lambda: body.stat().st_size == 500)
+            assert (await client.head(url)).headers["Upload-Offset"] == "500"
+            assert (await send(client, url, 500, ARCHIVE[500:])).status_code == 204
+        finally:
+            writer.close()
 
 
 class CuttingProxy:

@@ -139,7 +139,7 @@ async def _append(
 ) -> None:
     left = upload.length - upload.offset
     chunks = body_of(request, patience_s=limits.idle_s, min_bytes_per_s=limits.min_bytes_per_s)
-    with await queue.threads.run(upload.path.open, "ab") as file:
+    with await queue.threads.run(upload.path.open, "ab", 0) as file:
         try:
             async for chunk in chunks:
                 left -= len(chunk)
