@@ -9,6 +9,7 @@ Sources of the rules:
 - BBR (draft-ietf-ccwg-bbr): what is sent is paced by the bottleneck, so that no queue forms.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -26,6 +27,8 @@ class Upload:
     relative_bytes: float
     share: float = 1.0
     """Share of the limit on time that it may take."""
+    climb: float = 0.8
+    """It is chosen again if it takes less than this share of its limit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,13 +37,14 @@ class Download:
 
     map_step: int
     relative_bytes: float
+    climb: float = 0.8
 
 
 # Best first. The bytes are those of a grey pair of 640x480, in kB; only their ratios matter. Half
 # size is better bought than quality below 50: at 18 kB its error is 0.69 px, that of JPEG 15 1.0.
 # JPEG 90 hardly helps, so it is for links on which it costs nothing.
 UPLOADS: tuple[Upload, ...] = (
-    Upload(90, 1, 93.0, share=0.4),
+    Upload(90, 1, 93.0, share=0.4, climb=0.4),
     Upload(80, 1, 64.7),
     Upload(70, 1, 52.7),
     Upload(50, 1, 39.4),
@@ -54,9 +58,9 @@ DOWNLOADS: tuple[Download, ...] = (Download(2, 28.0), Download(4, 10.0))
 _UP_S, _DOWN_S = 0.024, 0.016
 # Most time on each way as a share of the time between two frames of the camera.
 _SHARE = 0.85
-# A rung is left downwards above, and upwards below, these shares of its limit. The gap between them
-# is wider than the noise of the measurement, so that a steady link has a steady rung.
-_LEAVE, _CLIMB = 1.15, 0.8
+# A rung is left above this share of its limit, and chosen again below its ``climb``. The gap
+# between them is wider than the noise of the measurement, so that a steady link has a steady rung.
+_LEAVE = 1.15
 _CALM_S = 1.0
 _FRAMES_NEEDED = 3
 # Google Congestion Control: overuse is a queue above its threshold that grows.
@@ -137,8 +141,10 @@ class LinkController:
         up_limits_s = [each.share * up_limit_s for each in self._uploads]
         down_limits_s = [down_limit_s] * len(self._downloads)
         calm = self._is_calm(now_s)
-        up = _next_rung(self._up, ups_s, up_limits_s, calm=calm, fresh=self._fresh)
-        down = _next_rung(self._down, downs_s, down_limits_s, calm=calm, fresh=self._fresh)
+        up = _next_rung(self._up, ups_s, up_limits_s, self._uploads, calm=calm, fresh=self._fresh)
+        down = _next_rung(
+            self._down, downs_s, down_limits_s, self._downloads, calm=calm, fresh=self._fresh
+        )
         if (up, down) != (self._up, self._down):
             self._calm_since_s = now_s
         self._up, self._down, self._fresh = up, down, False
@@ -176,13 +182,19 @@ class LinkController:
 
 
 def _next_rung(
-    now: int, times_s: list[float], limits_s: list[float], *, calm: bool, fresh: bool
+    now: int,
+    times_s: list[float],
+    limits_s: list[float],
+    rungs: Sequence[Upload | Download],
+    *,
+    calm: bool,
+    fresh: bool,
 ) -> int:
     """Return the next rung: down as far as it must, up by one at a time."""
     fitting = (rung for rung, time_s in enumerate(times_s) if time_s <= limits_s[rung])
     best = next(fitting, len(times_s) - 1)
     if fresh or times_s[now] > _LEAVE * limits_s[now]:
         return best
-    if calm and now > 0 and times_s[now - 1] <= _CLIMB * limits_s[now - 1]:
+    if calm and now > 0 and times_s[now - 1] <= rungs[now - 1].climb * limits_s[now - 1]:
         return now - 1
     return now

@@ -2,6 +2,7 @@
 
 import heapq
 import random
+from collections import Counter
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -145,9 +146,10 @@ def test_a_steady_link_gets_a_steady_rung(mbit: float, jitter_s: float, seed: in
     simulation = Simulation(mbit, jitter_s=jitter_s, seed=seed)
     simulation.run(10)
     simulation.run(10)
-    changes = sum(before != after for before, after in pairwise(simulation.rungs))
-    # A rung may still be climbed; it is never left and climbed again.
-    assert changes <= (1 if jitter_s else 0)
+    left = Counter(up for (up, _), (after, _) in pairwise(simulation.rungs) if after > up)
+    # Jitter of a third of the time between frames may look like a queue, once: no rung is left
+    # twice, so the format does not go to and fro.
+    assert max(left.values(), default=0) <= (1 if jitter_s else 0)
 
 
 @settings(max_examples=10, deadline=None)
