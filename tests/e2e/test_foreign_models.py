@@ -7,7 +7,7 @@ import numpy as np
 import onnxruntime
 import pytest
 
-from tests.support.foreign_graphs import HEIGHT, LAYOUTS, WIDTH, written
+from tests.support.foreign_graphs import GRAPHS, HEIGHT, WIDTH, written
 from tests.support.server import PATIENCE_S, running_server
 from tests.support.session_frames import EXACT
 from tests.support.zenoh_net import address_of, free_endpoint
@@ -32,7 +32,7 @@ def by_hand(path: Path, pair: Scene) -> np.ndarray[tuple[int, ...], np.dtype[np.
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return written(LAYOUTS["hitnet"].make(), tmp_path_factory.mktemp("theirs") / "hitnet.onnx")
+    return written(GRAPHS["hitnet"].make(), tmp_path_factory.mktemp("theirs") / "hitnet.onnx")
 
 
 async def test_over_grpc_http_and_zenoh_the_map_is_that_of_the_graph_by_hand(path: Path) -> None:

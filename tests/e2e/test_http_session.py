@@ -8,7 +8,7 @@ import pytest
 from tests.support.frames import RIG
 from tests.support.http import disparities, ended, http_to, submit
 from tests.support.models import RecallModel
-from tests.support.polling import eventually, eventually_true
+from tests.support.polling import eventually
 from tests.support.proxy import proxy_to
 from tests.support.sequences import make_frames, sequence_files, zip_bytes
 from tests.support.server import running_server
@@ -62,7 +62,8 @@ async def test_every_door_gives_the_same_disparity() -> None:
             await ended(web, job["id"])
             in_batch = await disparities(web, job["id"])
     np.testing.assert_array_equal(over_http, over_grpc)
-    np.testing.assert_array_equal(over_http, in_batch)
+    # Jobs keep their maps at 1/64 px.
+    np.testing.assert_array_equal(np.rint(np.multiply(over_http, 64)) / 64, in_batch)
 
 
 async def test_live_frames_come_back_and_the_stream_ends_with_the_session() -> None:
@@ -127,10 +128,8 @@ async def test_a_client_that_vanished_leaves_its_stream_to_another() -> None:
             await step(session, FRAMES[0])
             token = session.resume_token
 
-        async def is_detached() -> bool:
-            return not (await client.stream_info("roaming")).attached
-
-        await eventually_true(is_detached)
+        stream = server.engine.streams.get("roaming")
+        await eventually(lambda: stream.attachment is None)
         taken = client.open_session(RIG, stream_id="roaming", resume_token=token)
         async with taken as again:
             assert (await step(again, FRAMES[1])).origin is Origin.RESUMED

@@ -17,8 +17,8 @@ from typer.testing import CliRunner
 from tests.support.foreign_graphs import (
     BYTES,
     DISPARITIES,
+    GRAPHS,
     HEIGHT,
-    LAYOUTS,
     UNIT,
     WIDTH,
     joined,
@@ -63,7 +63,7 @@ def add_layout(folder: Path) -> Callable[[str], Added]:
 
     @functools.cache
     def add_once(name: str) -> Added:
-        path = written(LAYOUTS[name].make(), folder / f"{key_of(name)}.of-others")
+        path = written(GRAPHS[name].make(), folder / f"{key_of(name)}.of-others")
         return add(folder, path, key_of(name), max_disparity_px=DISPARITIES)
 
     return add_once
@@ -88,11 +88,11 @@ def share_right(found_px: np.ndarray[Any, Any], pair: Scene) -> float:
     return float((np.abs(found_px - pair.truth_px)[known] <= 1).mean())
 
 
-@pytest.mark.parametrize("name", LAYOUTS)
+@pytest.mark.parametrize("name", GRAPHS)
 def test_a_published_layout_is_guessed_proven_and_served(
     name: str, folder: Path, add_layout: Callable[[str], Added]
 ) -> None:
-    layout = LAYOUTS[name]
+    layout = GRAPHS[name]
     added = add_layout(name)
     contract = added.contract
     assert (contract.pixels, contract.factor) == (layout.pixels, layout.factor)
@@ -164,7 +164,7 @@ def test_a_model_that_was_added_passes_its_check(
 
 
 def test_what_the_user_says_is_not_corrected_and_nothing_is_written(tmp_path: Path) -> None:
-    path = written(LAYOUTS["raft"].make(), tmp_path / "raft.onnx")
+    path = written(GRAPHS["raft"].make(), tmp_path / "raft.onnx")
     for given, says in (
         ({"factor": 1.0}, "sign"),
         ({"left": "x2", "right": "x1"}, "sides"),
@@ -183,7 +183,7 @@ def test_what_the_user_says_is_not_corrected_and_nothing_is_written(tmp_path: Pa
 
 
 def test_graphs_beside_the_contract_that_do_something_else_are_found(tmp_path: Path) -> None:
-    path = written(LAYOUTS["igev"].make(), tmp_path / "igev.onnx")
+    path = written(GRAPHS["igev"].make(), tmp_path / "igev.onnx")
     add(tmp_path, path, "kept")
     add(tmp_path, path, "other", sigma_px=2.0)
     manifest = read_manifest(tmp_path)
@@ -197,7 +197,7 @@ def test_sigma_is_the_networks_confidence_a_second_look_or_a_constant(
     folder: Path, tmp_path: Path
 ) -> None:
     pair = scene(HEIGHT, WIDTH, 6, 30, seed=4)
-    ess = written(LAYOUTS["ess"].make(), tmp_path / "ess.onnx")
+    ess = written(GRAPHS["ess"].make(), tmp_path / "ess.onnx")
     columns = np.arange(WIDTH)
     hidden = np.isnan(pair.truth_px) & (columns >= 6)  # behind the board, for the right camera
     for name, given in (
@@ -323,7 +323,7 @@ def test_the_command_adds_lists_checks_and_the_server_finds_the_model(
 ) -> None:
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     monkeypatch.setenv("COLUMNS", "200")
-    path = written(LAYOUTS["igev"].make(), tmp_path / "igev_sceneflow.onnx")
+    path = written(GRAPHS["igev"].make(), tmp_path / "igev_sceneflow.onnx")
     run = CliRunner()
     added = run.invoke(models, ["add", str(path), "--name", "theirs", "--max-disparity", "48"])
     assert added.exit_code == 0, added.output
@@ -351,7 +351,7 @@ def test_a_model_that_was_added_is_a_row_beside_the_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
-    path = written(LAYOUTS["igev"].make(), tmp_path / "igev.onnx")
+    path = written(GRAPHS["igev"].make(), tmp_path / "igev.onnx")
     add(user_models_dir(), path, "theirs", max_disparity_px=DISPARITIES)
     [studied] = gather_networks([], [], threads=1, models=["theirs"])
     assert (studied.warm, studied.single_frame, studied.warps) == ((), (1,), False)

@@ -360,7 +360,7 @@ TRUTH_OF_ONE = {
     "apollo": "disparity/*26454_Camera_5.png",
 }
 ONE_TRUTH_FOR_ALL_FRAMES = {"booster"}
-NO_TRUTH = {"kitti", "euroc"}
+NO_TRUTH = {"kitti", "euroc", "mcap"}
 
 
 def test_no_kind_is_forgotten() -> None:
@@ -406,7 +406,7 @@ IMAGES_ALONE = {
 }
 
 
-@pytest.mark.parametrize("kind", field.TREES)
+@pytest.mark.parametrize("kind", IMAGES_ALONE)
 def test_images_alone_are_a_source_without_truth_poses_or_metres(kind: str, tmp_path: Path) -> None:
     path = field.TREES[kind](tmp_path)
     count = len(open_source(f"{kind}:{path}"))

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from vergence_proto.datasets import read_disparity_png, read_pfm
 from vergence_proto.errors import BadImage, BadShape
 from vergence_proto.geometry import Pose, RectifiedRig
+from vergence_proto.job_results.folders import RESULT_LAYOUTS
+from vergence_proto.job_results.folders.base import About
 from vergence_proto.job_results.frame_file import JobFrame, decode_frame, encode_frame, is_whole
-from vergence_proto.job_results.layouts import LAYOUTS
-from vergence_proto.job_results.layouts.base import About
 from vergence_proto.job_results.manifest import about_of
 from vergence_proto.job_results.points import points_of
 from vergence_proto.job_results.records import FrameRecord
@@ -76,7 +76,7 @@ def about(*outputs: str) -> About:
 
 
 def files_of(form: ResultFormat, *outputs: str) -> dict[str, bytes]:
-    layout = LAYOUTS[form](about(*outputs))
+    layout = RESULT_LAYOUTS[form](about(*outputs))
     files = [file for frame in FRAMES for file in layout.frame(frame)]
     return dict([*files, *layout.end()])
 
@@ -101,7 +101,7 @@ def points(depth_m: NDArray[Any], camera: list[float], world: NDArray[Any]) -> N
     return np.asarray((world @ xyz)[:3].T)
 
 
-@pytest.mark.parametrize("form", [*LAYOUTS], ids=str)
+@pytest.mark.parametrize("form", [*RESULT_LAYOUTS], ids=str)
 def test_every_layout_has_its_manifest_and_a_line_for_every_frame(form: ResultFormat) -> None:
     files = files_of(form)
     manifest = json.loads(files["manifest.json"])

@@ -21,8 +21,12 @@ from tests.support.dataset_trees import (
     write_lines,
     write_pfm_by_hand,
 )
-from vergence_proto.geometry import Matrix, Pose
-from vergence_proto.types import Plane
+from vergence.recording import SessionRecording
+from vergence.results import DepthResult
+from vergence_proto import codec
+from vergence_proto.geometry import Matrix, Pose, RectifiedRig
+from vergence_proto.types import ImageEncoding, OutputFormat, Plane, StereoFrame, StereoRig
+from vergence_proto.v1 import depth_pb2 as pb
 
 HIDDEN = np.zeros((HEIGHT, WIDTH), np.bool_)  # what the right camera does not see
 HIDDEN[4:7, :3] = True
@@ -348,7 +352,25 @@ def apollo_recording(root: Path, count: int = 3, steps_per_px: float = 256) -> P
     return folder
 
 
+def mcap_recording(root: Path, count: int = 3) -> Path:
+    """A session that was recorded: the messages that a server would have sent and received."""
+    rig = RectifiedRig(WIDTH, HEIGHT, 20, 20, 11.5, 11.5, 7.5, 0.1)
+    opening = pb.OpenStream(rig=codec.rig_to_proto(StereoRig.from_rectified(rig)))
+    opened = pb.StreamOpened(rig=codec.rectified_rig_to_proto(rig))
+    path = root / "walk.mcap"
+    root.mkdir(parents=True, exist_ok=True)
+    with SessionRecording(path, opening, opened) as recording:
+        for frame_id in range(1, count + 1):
+            left, right = an_image(frame_id), an_image(50 + frame_id)
+            frame = StereoFrame(frame_id, frame_id * 40_000_000, left, right)
+            recording.sent(frame_id, codec.frame_to_request(frame, encoding=ImageEncoding.RAW))
+            result = DepthResult(frame_id, frame.capture_ns, rig, a_disparity(frame_id))
+            recording.answered(codec.disparity_to_proto(result, OutputFormat()), result)
+    return path
+
+
 TREES: dict[str, Callable[[Path], Path]] = {
+    "mcap": mcap_recording,
     "sintel": sintel_scene,
     "spring": spring_sequence,
     "vkitti2": vkitti2_scene,

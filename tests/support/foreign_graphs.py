@@ -158,7 +158,7 @@ class Layout:
     like: str | None = None
 
 
-LAYOUTS = {
+GRAPHS = {
     "raft": Layout(
         lambda: two_images("x1", "x2", "output", BYTES, factor=-1), "0..255", -1, "raft-stereo"
     ),

@@ -136,10 +136,11 @@ def checked(answer: "httpx.Response") -> "httpx.Response":
     """Return an answer that is no error. Raises the error that the server names."""
     if not answer.is_error:
         return answer
-    if answer.headers.get("Content-Type") == "application/problem+json":
+    head = answer.request.method == "HEAD"  # its answer has no body
+    if not head and answer.headers.get("Content-Type") == "application/problem+json":
         problem = answer.json()
         if "reason" in problem:
             raise error_from_wire(problem["reason"], problem["detail"])
-    if answer.request.method == "HEAD" and answer.status_code == 404:  # it has no body
+    if head and answer.status_code == 404:
         raise UnknownSequence(f"{answer.url.path} is not there, or no longer")
     raise ConnectionLost(f"{answer.url} answered {answer.status_code}: is it a Vergence server?")

@@ -10,7 +10,7 @@ from vergence_proto.job_results.frame_file import JobFrame
 from vergence_proto.jobs import ResultFormat
 
 if TYPE_CHECKING:
-    from vergence_proto.job_results.layouts import File
+    from vergence_proto.job_results.folders import File
 
 MANIFEST = "manifest.json"
 _RIG = "rig.json"
@@ -25,9 +25,9 @@ _OWN_SUFFIXES |= {".jsonl"}
 def checked_format(form: str) -> ResultFormat:
     """Return the format. Raises BadShape: there is no such format of folders."""
     # Here, because the layouts take as long to load as the rest of the client.
-    from vergence_proto.job_results.layouts import LAYOUTS
+    from vergence_proto.job_results.folders import RESULT_LAYOUTS
 
-    known = [each.value for each in LAYOUTS]
+    known = [each.value for each in RESULT_LAYOUTS]
     if form not in known:
         raise BadShape(f"expected a format of {', '.join(known)}, got {form!r}")
     return ResultFormat(form)
@@ -91,14 +91,14 @@ class Saving:
     """
 
     def __init__(self, folder: Path, form: str, manifest: Mapping[str, Any]) -> None:
-        from vergence_proto.job_results.layouts import LAYOUTS
+        from vergence_proto.job_results.folders import RESULT_LAYOUTS
         from vergence_proto.job_results.manifest import about_of
 
         self._about_of = about_of
         self._folder = folder
         self._form = checked_format(form)
         stated = {**manifest, "format": self._form.value, "state": "incomplete"}
-        self._layout = LAYOUTS[self._form](about_of(stated))
+        self._layout = RESULT_LAYOUTS[self._form](about_of(stated))
         (folder / MANIFEST).write_text(json.dumps(stated), "utf-8")
 
     def write(self, frame: JobFrame) -> None:

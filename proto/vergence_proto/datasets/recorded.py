@@ -16,6 +16,7 @@ from google.protobuf.message import Message
 
 from vergence_proto import codec, recordings
 from vergence_proto.datasets.files import DatasetError
+from vergence_proto.datasets.listing import is_data
 from vergence_proto.datasets.source import FrameFiles, SourceFrame, StereoSource
 from vergence_proto.errors import DepthError
 from vergence_proto.extras import how_to_install
@@ -152,7 +153,11 @@ def find(folder: Path) -> list[Path]:
     """List the MCAP files in or under a folder."""
     if folder.is_file():
         return [folder] if folder.suffix == ".mcap" else []
-    return sorted(each for each in folder.rglob("*.mcap") if each.is_file())
+    return sorted(
+        each
+        for each in folder.rglob("*.mcap")
+        if each.is_file() and all(map(is_data, each.relative_to(folder).parts))
+    )
 
 
 def _source(

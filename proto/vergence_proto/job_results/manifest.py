@@ -5,7 +5,7 @@ from typing import Any
 
 from vergence_proto.errors import BadSequence
 from vergence_proto.geometry import RectifiedRig
-from vergence_proto.job_results.layouts.base import About
+from vergence_proto.job_results.folders.base import About
 from vergence_proto.jobs import JobOutput
 
 VERSION = 1

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 
 from vergence_proto.film import CannotFilm, FilmWriter
+from vergence_proto.job_results.folders import RESULT_LAYOUTS
 from vergence_proto.job_results.frame_file import STEPS_PER_PX
-from vergence_proto.job_results.layouts import LAYOUTS
 from vergence_proto.job_results.manifest import VERSION, about_of
 from vergence_proto.jobs import ResultFormat
 from vergence_proto.types import Plane
@@ -92,7 +92,7 @@ def zip_of(status: JobStatus, folder: Path, form: ResultFormat) -> Iterator[byte
 
     Raises BadShape before the first piece: the job has not kept what the layout needs.
     """
-    layout = LAYOUTS[form](about_of(manifest_of(status, folder)))
+    layout = RESULT_LAYOUTS[form](about_of(manifest_of(status, folder)))
     return _zipping(layout.frame, layout.end, folder)
 
 

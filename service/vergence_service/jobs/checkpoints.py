@@ -12,7 +12,7 @@ from pathlib import Path
 
 from vergence_service.inference.model import RecurrentState
 from vergence_service.inference.snapshots import state_from_bytes, state_to_bytes
-from vergence_service.jobs.tally import Tally
+from vergence_service.jobs.tally import FrameCounts
 
 _LONGEST_LINE = 64 << 20  # it lists the accuracy of every frame
 
@@ -24,7 +24,7 @@ class Checkpoint:
     frames: int
     state: RecurrentState  # state after these frames
     weights_sha256: str  # weights that the state belongs to
-    tally: Tally  # what these frames add up to
+    tally: FrameCounts  # what these frames add up to
 
 
 def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
@@ -57,7 +57,7 @@ def read_checkpoint(path: Path) -> Checkpoint | None:
             frames=about["frames"],
             state=state_from_bytes(state),
             weights_sha256=about["weights_sha256"],
-            tally=Tally.from_values(about["tally"]),
+            tally=FrameCounts.from_values(about["tally"]),
         )
     except (FileNotFoundError, KeyError, TypeError, ValueError):  # BadSnapshot is a ValueError
         return None

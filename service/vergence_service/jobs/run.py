@@ -34,7 +34,7 @@ from vergence_service.jobs.results import (
 from vergence_service.jobs.sources import open_below, relative_text, sequence_error
 from vergence_service.jobs.stepping import Skipped, Stepped, step_all
 from vergence_service.jobs.storage import disk_trouble
-from vergence_service.jobs.tally import Tally
+from vergence_service.jobs.tally import FrameCounts
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.rectify import Rectifier
 from vergence_service.streams.stream import StreamConfig
@@ -91,7 +91,7 @@ async def run_job(
         # First of all: a checkpoint of other weights must not continue the frames of this run.
         await background.run((folder / CHECKPOINT).unlink, missing_ok=True)
     start, state = (before.frames, before.state) if before else (0, None)
-    tally = before.tally if before else Tally()
+    tally = before.tally if before else FrameCounts()
 
     def may_skip(error: DatasetError | DepthError) -> bool:
         # What the disk refuses to read can be read later.

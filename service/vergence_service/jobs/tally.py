@@ -15,7 +15,7 @@ _WARM = {Origin.WARM.value, Origin.RESUMED.value}
 
 
 @dataclass(frozen=True, slots=True)
-class Tally:
+class FrameCounts:
     """The sums over the first frames of a job."""
 
     frames: int = 0
@@ -56,9 +56,9 @@ class Tally:
         return cls(**{**values, "errors": tuple(values["errors"]), "measured": measured})
 
 
-def tally_of(records: Iterable[FrameRecord]) -> Tally:
+def tally_of(records: Iterable[FrameRecord]) -> FrameCounts:
     """Return what frames add up to."""
-    tally = Tally()
+    tally = FrameCounts()
     for record in records:
         tally = tally.after(record)
     return tally

@@ -12,10 +12,10 @@ from fastapi import Path as PathParameter
 from pydantic import BaseModel, ConfigDict, Field
 
 from vergence_proto.errors import BadShape, SequenceNotDone, UnknownSequence
+from vergence_proto.job_results.folders import RESULT_LAYOUTS
+from vergence_proto.job_results.folders.base import About
+from vergence_proto.job_results.folders.maps import MapLayout
 from vergence_proto.job_results.frame_file import MEDIA_TYPE, decode_frame
-from vergence_proto.job_results.layouts import LAYOUTS
-from vergence_proto.job_results.layouts.base import About
-from vergence_proto.job_results.layouts.maps import MapLayout
 from vergence_proto.jobs import JobOutput, ResultFormat
 from vergence_service.jobs.archive import manifest_of
 from vergence_service.jobs.progress import JobStatus
@@ -201,7 +201,7 @@ def _file_of(data: bytes, folder: Path, file: FrameFile, status: JobStatus) -> t
     frame = decode_frame(data, rig)
     if frame.disparity is None:
         raise UnknownSequence(f"frame {frame.record.index} has no map: {frame.record.error}")
-    layout = LAYOUTS[_MAP_FORMATS.get(suffix, ResultFormat.PNG16)](
+    layout = RESULT_LAYOUTS[_MAP_FORMATS.get(suffix, ResultFormat.PNG16)](
         About(manifest={}, rig=rig, outputs=[output])
     )
     assert isinstance(layout, MapLayout)

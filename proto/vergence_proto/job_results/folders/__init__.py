@@ -6,18 +6,18 @@
 
 from collections.abc import Callable, Mapping
 
-from vergence_proto.job_results.layouts.base import About, File, Layout
-from vergence_proto.job_results.layouts.benchmarks import eth3d_layout, middlebury_layout
-from vergence_proto.job_results.layouts.colmap import ColmapLayout
-from vergence_proto.job_results.layouts.kitti import KittiLayout
-from vergence_proto.job_results.layouts.maps import MapLayout
-from vergence_proto.job_results.layouts.nerfstudio import NerfstudioLayout
-from vergence_proto.job_results.layouts.tum import TumLayout
+from vergence_proto.job_results.folders.base import About, File, Layout
+from vergence_proto.job_results.folders.benchmarks import eth3d_layout, middlebury_layout
+from vergence_proto.job_results.folders.colmap import ColmapLayout
+from vergence_proto.job_results.folders.kitti import KittiLayout
+from vergence_proto.job_results.folders.maps import MapLayout
+from vergence_proto.job_results.folders.nerfstudio import NerfstudioLayout
+from vergence_proto.job_results.folders.tum import TumLayout
 from vergence_proto.jobs import ResultFormat
 
-__all__ = ["LAYOUTS", "About", "File", "Layout"]
+__all__ = ["RESULT_LAYOUTS", "About", "File", "Layout"]
 
-LAYOUTS: Mapping[ResultFormat, Callable[[About], Layout]] = {
+RESULT_LAYOUTS: Mapping[ResultFormat, Callable[[About], Layout]] = {
     **{
         form: MapLayout.of(form)
         for form in (

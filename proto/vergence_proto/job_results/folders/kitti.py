@@ -8,8 +8,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from vergence_proto.datasets.images import encode_disparity_png
+from vergence_proto.job_results.folders.base import About, File, Layout, image_suffix, numbers
 from vergence_proto.job_results.frame_file import JobFrame
-from vergence_proto.job_results.layouts.base import About, File, Layout, image_suffix, numbers
 from vergence_proto.jobs import JobOutput
 
 

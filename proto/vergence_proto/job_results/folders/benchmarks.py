@@ -10,8 +10,8 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from vergence_proto.datasets.images import encode_pfm
+from vergence_proto.job_results.folders.base import About, File, Layout
 from vergence_proto.job_results.frame_file import JobFrame
-from vergence_proto.job_results.layouts.base import About, File, Layout
 
 _METHOD = "Vergence"
 

@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from vergence_proto.job_results.folders.base import About, File, Layout, left_png, numbers
 from vergence_proto.job_results.frame_file import JobFrame
-from vergence_proto.job_results.layouts.base import About, File, Layout, left_png, numbers
 from vergence_proto.jobs import JobOutput
 from vergence_proto.opencv import cv2
 from vergence_proto.types import Plane

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vergence_proto.job_results.folders.base import About, File, Layout, image_suffix
 from vergence_proto.job_results.frame_file import JobFrame
-from vergence_proto.job_results.layouts.base import About, File, Layout, image_suffix
 from vergence_proto.job_results.points import encode_ply
 from vergence_proto.jobs import JobOutput, Output, ResultFormat
 from vergence_proto.result_files import encode_depth_mm_png, encode_maps

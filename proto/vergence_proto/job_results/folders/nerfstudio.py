@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from vergence_proto.job_results.folders.base import About, File, PosedLayout, left_file, posed
 from vergence_proto.job_results.frame_file import JobFrame
-from vergence_proto.job_results.layouts.base import About, File, PosedLayout, left_file, posed
 from vergence_proto.jobs import JobOutput
 from vergence_proto.result_files import encode_depth_mm_png
 

@@ -8,8 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from vergence_proto.job_results.frame_file import JobFrame
-from vergence_proto.job_results.layouts.base import (
+from vergence_proto.job_results.folders.base import (
     About,
     File,
     PosedLayout,
@@ -17,6 +16,7 @@ from vergence_proto.job_results.layouts.base import (
     numbers,
     posed,
 )
+from vergence_proto.job_results.frame_file import JobFrame
 from vergence_proto.jobs import JobOutput
 
 _CENTRE_PX = 0.5  # its pixel centres lie at halves, ours at integers
