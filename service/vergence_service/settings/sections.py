@@ -133,7 +133,7 @@ class ModelSettings(Section):
 
 
 class StreamSettings(Section):
-    capacity: PositiveInt = Field(default=16, description="most streams that are open at once")
+    capacity: PositiveInt = Field(default=64, description="most streams that are open at once")
     credit: PositiveInt = Field(
         default=2, description="most frames that a client may send before an answer returns"
     )
