@@ -106,7 +106,7 @@ class ZenohSession:
 
     def __init__(self, config: zenoh.Config) -> None:
         self._config = config
-        self.user = user_of(config)  # empty: without a name
+        self.user: str = user_of(config)  # empty: without a name
         self._closed = False
         self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="zenoh")
 
