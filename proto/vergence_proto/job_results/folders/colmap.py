@@ -25,7 +25,7 @@ _CENTRE_PX = 0.5  # its pixel centres lie at halves, ours at integers
 class ColmapLayout(PosedLayout):
     """Frames with poses, as COLMAP and pycolmap read them."""
 
-    needs: ClassVar = {JobOutput.LEFT: "the images of a COLMAP model"}
+    needs: ClassVar[Mapping[JobOutput, str]] = {JobOutput.LEFT: "the images of a COLMAP model"}
 
     def __init__(self, about: About) -> None:
         super().__init__(about)

@@ -24,7 +24,9 @@ _CENTRE_PX = 0.5
 class NerfstudioLayout(PosedLayout):
     """Frames with poses, as nerfstudio reads them."""
 
-    needs: ClassVar = {JobOutput.LEFT: "the images of a nerfstudio data set"}
+    needs: ClassVar[Mapping[JobOutput, str]] = {
+        JobOutput.LEFT: "the images of a nerfstudio data set"
+    }
 
     def __init__(self, about: About) -> None:
         super().__init__(about)

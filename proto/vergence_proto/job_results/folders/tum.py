@@ -20,7 +20,9 @@ _STEPS_PER_M = np.float32(5000)
 class TumLayout(Layout):
     """Colour, depth and trajectory with times in seconds."""
 
-    needs: ClassVar = {JobOutput.LEFT: "the images of a TUM RGB-D sequence"}
+    needs: ClassVar[Mapping[JobOutput, str]] = {
+        JobOutput.LEFT: "the images of a TUM RGB-D sequence"
+    }
 
     def __init__(self, about: About) -> None:
         super().__init__(about)
