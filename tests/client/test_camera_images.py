@@ -11,26 +11,18 @@ from numpy.typing import NDArray
 from tests.support.frames import RIG, make_frame
 from tests.support.server import running_server
 from tests.support.session_frames import EXACT
+from tests.support.shipped_model import shipped_model
 from vergence import BadImage, BadShape, Delivery, DepthClient
-from vergence_service.inference.engines import load_model
-from vergence_service.inference.onnx_model import packaged_weights_dir
+from vergence_service.inference.model import StereoModel
 
 
 @pytest.fixture(scope="module")
-def model() -> Any:
-    """The network that ships: its results depend on the pixels."""
-    return load_model(
-        packaged_weights_dir(),
-        "lite",
-        engine="auto",
-        providers=["cpu"],
-        threads=1,
-        allow_spinning=False,
-    )
+def model() -> StereoModel:
+    return shipped_model()
 
 
 @pytest.fixture
-async def client(model: Any) -> AsyncIterator[DepthClient]:
+async def client(model: StereoModel) -> AsyncIterator[DepthClient]:
     async with running_server(model) as server, DepthClient(server.grpc_address) as client:
         yield client
 

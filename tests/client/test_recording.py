@@ -22,6 +22,7 @@ from tests.support.models import RecallModel
 from tests.support.scene import scene
 from tests.support.server import running_server
 from tests.support.session_frames import EXACT, step, submit
+from tests.support.shipped_model import shipped_model
 from vergence import (
     Axes,
     Delivery,
@@ -39,9 +40,7 @@ from vergence.cli.sources import CalibrationFlags, footage_at
 from vergence_proto import codec, recordings
 from vergence_proto.datasets import DatasetError, RecordedSource, SourceFrame, open_source
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_service.inference.engines import load_model
 from vergence_service.inference.model import StereoModel
-from vergence_service.inference.onnx_model import packaged_weights_dir
 
 FRAMES = 5
 RESET_BEFORE = 3
@@ -50,15 +49,7 @@ BLACK = np.zeros((RIG.height, RIG.width), np.uint8)
 
 @pytest.fixture(scope="module")
 def model() -> StereoModel:
-    """The network that ships: its results depend on every bit."""
-    return load_model(
-        packaged_weights_dir(),
-        "lite",
-        engine="auto",
-        providers=["cpu"],
-        threads=1,
-        allow_spinning=False,
-    )
+    return shipped_model()
 
 
 @pytest.fixture

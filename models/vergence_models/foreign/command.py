@@ -89,7 +89,7 @@ def _add(
 
     Its contract is guessed from names and shapes, and proven on shifted textures before anything
     is written. A contract that contradicts the textures is refused with what was seen. Red and
-    blue cannot be told apart by textures: say --order bgr if it wants that.
+    blue look the same on textures: say --order bgr if it wants that.
     """
     with _in_one_line():
         from vergence_models.foreign.adding import add_model

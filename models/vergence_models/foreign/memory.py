@@ -17,7 +17,7 @@ _MAPS_BYTES_A_PIXEL = 64.0  # of resizing to and from a graph of a fixed size
 
 
 def measured_memory(folder: Path, name: str, contract: Contract) -> StepMemory | None:
-    """Return the memory of a step of any size; None if this system does not tell it."""
+    """Return the memory of a step of any size; None if this system does not report it."""
     if not _STATUS.exists():
         return None
     height, width = texture_size(contract)

@@ -17,6 +17,7 @@ from vergence_proto.errors import UnknownSequence
 from vergence_service.access.principals import Principal
 
 _BODY, _ABOUT = "body", "about.json"
+_UNFINISHED = "."  # the beginning of the name of a folder that is being made
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,9 +42,12 @@ class KeptUploads:
         """Make an empty upload of ``length`` bytes."""
         self.expire()
         folder = self._directory / secrets.token_hex(16)
-        folder.mkdir(parents=True, mode=0o700)
-        (folder / _BODY).touch()
-        (folder / _ABOUT).write_text(json.dumps({"length": length, "owner": owner.name}))
+        # Renamed when it is whole: another thread that expires uploads sees all of it or nothing.
+        unfinished = folder.with_name(f"{_UNFINISHED}{folder.name}")
+        unfinished.mkdir(parents=True, mode=0o700)
+        (unfinished / _BODY).touch()
+        (unfinished / _ABOUT).write_text(json.dumps({"length": length, "owner": owner.name}))
+        unfinished.rename(folder)
         return self._read(folder)
 
     def get(self, upload_id: str, caller: Principal) -> KeptUpload:
@@ -70,10 +74,13 @@ class KeptUploads:
         """Delete the uploads to which nothing was added for too long."""
         for folder in self._directory.iterdir() if self._directory.is_dir() else ():
             try:
-                gone = self._read(folder).expires_s <= time.time()
-            except (OSError, ValueError, KeyError):  # a crash while it was made
-                gone = True
-            if gone:
+                if folder.name.startswith(_UNFINISHED):  # of a crash, if it stays so
+                    expires_s = folder.stat().st_mtime + self._keep_s
+                else:
+                    expires_s = self._read(folder).expires_s
+            except (OSError, ValueError, KeyError):  # deleted meanwhile, or damaged
+                expires_s = 0.0
+            if expires_s <= time.time():
                 shutil.rmtree(folder, ignore_errors=True)
 
     def _read(self, folder: Path) -> KeptUpload:
