@@ -50,6 +50,10 @@ def _ignore_hangups() -> None:
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
 
 
+def _hear_hangups() -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests themselves may run under nohup
+
+
 def test_no_server_outlives_the_command_that_started_it(tmp_path: Path) -> None:
     ends = {
         # First: this one ends by itself, after three seconds.
@@ -67,7 +71,7 @@ def test_no_server_outlives_the_command_that_started_it(tmp_path: Path) -> None:
             env={**os.environ, **model},
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            preexec_fn=_ignore_hangups if name == "nohup" else None,
+            preexec_fn=_ignore_hangups if name == "nohup" else _hear_hangups,
         )
     servers = {}
     try:

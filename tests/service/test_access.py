@@ -433,7 +433,7 @@ async def test_the_environment_and_the_command_make_and_show_tokens(
         f"http://{guarded.server.http_address}",
     ):
         async with DepthClient(address) as client:
-            assert (await client.server_info()).streams_max == 16
+            assert (await client.server_info()).streams_max == 64
     async with httpx.AsyncClient() as plain:
         answer = await plain.get(f"http://{guarded.server.http_address}/v1/sequences")
     assert answer.status_code == 401

@@ -110,7 +110,7 @@ async def test_every_service_answers_behind_the_deadline() -> None:
         health = health_pb2_grpc.HealthStub(channel)
         answer = await health.Check(health_pb2.HealthCheckRequest())
         assert answer.status == health_pb2.HealthCheckResponse.SERVING
-        assert (await stub.GetServerInfo(pb.GetServerInfoRequest())).streams_max == 16
+        assert (await stub.GetServerInfo(pb.GetServerInfoRequest())).streams_max == 64
         invoke: Any = channel.unary_unary
         with pytest.raises(grpc.aio.AioRpcError) as failure:
             await invoke("/vergence.v1.DepthService/Nothing")(b"")

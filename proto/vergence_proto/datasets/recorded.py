@@ -125,7 +125,7 @@ def open_path(path: Path) -> RecordedSource:
     Raises DatasetError: the file is damaged, was cut, or is no recording of a session.
     """
     if not path.is_file():
-        raise DatasetError(f"{path}: no such file")
+        raise DatasetError(f"{path}: expected an MCAP file, a recording of a session; found none")
     openings: list[pb.OpenStream] = []
     frames: list[tuple[int, pb.Frame]] = []
     maps: dict[int, pb.DisparityMap] = {}
