@@ -11,6 +11,7 @@ import time
 from collections.abc import AsyncGenerator, Callable, Coroutine, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AsyncExitStack
+from dataclasses import dataclass
 from typing import Any, ParamSpec, Self, TypeVar
 
 Args = ParamSpec("Args")
@@ -35,6 +36,21 @@ async def to_the_end(work: Coroutine[Any, Any, Result]) -> Result:
     except asyncio.CancelledError:
         await asyncio.wait([task])
         raise
+
+
+@dataclass(slots=True, eq=False)
+class Cost:
+    """Counts the processor's time for the work of one frame."""
+
+    seconds: float = 0.0
+
+    def of(self, work: Callable[Args, Result], *args: Args.args, **kwargs: Args.kwargs) -> Result:
+        """Do work in this thread, and add the processor's time, also of work that fails."""
+        started_s = time.thread_time()
+        try:
+            return work(*args, **kwargs)
+        finally:
+            self.seconds += time.thread_time() - started_s
 
 
 class ThreadPool:

@@ -23,12 +23,13 @@ from vergence_proto.geometry import Axes, Pose
 from vergence_proto.types import Delivery, DisparityMap, Origin, PoseSample, StereoFrame, StereoRig
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.stream import StreamConfig
+from vergence_service.threads import Cost
 
 OPENING = StreamConfig(StereoRig.from_rectified(RIG))
 
 
 async def step(engine: DepthEngine, stream_id: str, frame: StereoFrame) -> DisparityMap:
-    answer = await engine.step(stream_id, lambda: frame, arrived_s=0.0)
+    answer = await engine.step(stream_id, lambda: frame, arrived_s=0.0, cost=Cost())
     return answer.disparity_map()
 
 
@@ -222,7 +223,7 @@ async def test_what_does_not_decode_is_refused_and_counted(error: DepthError) ->
     async with running_server(RecallModel()) as server:
         stream = await server.engine.open("a", OPENING)
         with pytest.raises(type(error)):
-            await server.engine.step("a", decode, arrived_s=0.0)
+            await server.engine.step("a", decode, arrived_s=0.0, cost=Cost())
         assert (stream.frames_failed, stream.state, stream.last_frame_id) == (1, None, 0)
 
 

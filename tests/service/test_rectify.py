@@ -17,6 +17,7 @@ from vergence_proto.types import Distortion, Intrinsics, PoseSample, StereoFrame
 from vergence_service.streams.rectify import Rectifier, check_rig
 from vergence_service.streams.search_window import SearchReach
 from vergence_service.streams.stream import StreamConfig
+from vergence_service.threads import Cost
 
 WIDTH, HEIGHT = 320, 240
 # Toed in, rolled a little, and not quite level.
@@ -109,7 +110,9 @@ async def test_replies_state_the_rectified_rig_its_pose_and_nothing_unseen() -> 
     frame = StereoFrame(1, 1, image, image, PoseSample(world_from_left))
     async with running_server(RecallModel()) as server:
         await server.engine.open("a", StreamConfig(rig))
-        answer = (await server.engine.step("a", lambda: frame, arrived_s=0.0)).disparity_map()
+        answer = (
+            await server.engine.step("a", lambda: frame, arrived_s=0.0, cost=Cost())
+        ).disparity_map()
     assert answer.rig == rectifier.rig
     assert answer.world_from_left is not None
     expected = world_from_left @ rectifier.left_from_rectified

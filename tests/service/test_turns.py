@@ -2,7 +2,7 @@
 
 import asyncio
 from collections import Counter, defaultdict
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import pytest
 
@@ -17,8 +17,18 @@ from vergence_service.streams.turns import Turns
 class Model:
     """Takes turns one after another, each for the seconds that its stream's steps cost."""
 
-    def __init__(self, costs_s: Mapping[str, float], *, lanes: int = 1, places: int = 1) -> None:
+    def __init__(
+        self,
+        costs_s: Mapping[str, float],
+        *,
+        lanes: int = 1,
+        places: int = 1,
+        encoding_s: Mapping[str, float] | None = None,
+        content: Collection[str] = (),
+    ) -> None:
         self.clock = ManualClock()
+        self._encoding_s = encoding_s or {}
+        self._content = content  # streams that get all the turns that they want
         self.turns = Turns(places=places, lanes=lanes, clock=self.clock)
         self._costs_s = costs_s
         self.used_s: dict[str, float] = defaultdict(float)
@@ -28,12 +38,16 @@ class Model:
 
     async def stream(self, name: str, owner: Principal, until_s: float) -> None:
         while self.clock.now_s < until_s:
-            async with self.turns.turn(name, owner, on_soon=lambda: None) as turn:
+            wants_more = name not in self._content
+            async with self.turns.turn(
+                name, owner, on_soon=lambda: None, wants_more=wants_more
+            ) as turn:
                 done = self._running[name] = asyncio.Event()
                 await done.wait()
-                turn.cost_s = self._costs_s[name]
-                self.used_s[owner.name] += turn.cost_s
+                turn.cost.seconds = self._costs_s[name]
+                self.used_s[owner.name] += turn.cost.seconds
                 self.count[name] += 1
+            self.turns.charge(name, owner, self._encoding_s.get(name, 0.0))
 
     async def run(self, owners: Mapping[str, Principal], seconds: float) -> None:
         """Give every stream turns as fast as it wants them, side by side in the lanes."""
@@ -83,6 +97,27 @@ async def test_long_steps_leave_a_lane_to_short_ones() -> None:
     model.most_long = 0  # at first, nobody knew
     await model.run(dict.fromkeys(("short", "long1", "long2", "long3"), one), 20)
     assert model.most_long == 1
+
+
+@pytest.mark.parametrize("owners", [("ana", "ana"), ("ana", "ben")], ids=["one owner", "two"])
+@pytest.mark.parametrize("content", [False, True], ids=["could use more", "has enough"])
+async def test_long_steps_pay_for_encoding_too_where_others_could_use_more(
+    owners: tuple[str, str], content: bool
+) -> None:
+    large_s, encoding_s = 0.2, 0.3
+    model = Model(
+        {"small": 0.02, "large": large_s},
+        lanes=2,
+        places=2,
+        encoding_s={"large": encoding_s},
+        content=["small"] if content else [],
+    )
+    await model.run(dict(zip(("small", "large"), map(Principal, owners), strict=True)), 60)
+    small_s = 0.02 * model.count["small"]
+    paid_s = (large_s + encoding_s) * model.count["large"]
+    assert small_s > 58  # it has a lane
+    # Both have the same use, or the large one has all that is left.
+    assert paid_s == pytest.approx(60 * (1 if not content else 2.5), rel=0.05)
 
 
 async def test_nobody_saves_turns_for_later() -> None:

@@ -20,6 +20,7 @@ from vergence_service.inference.arrivals import ArrivalPredictor
 from vergence_service.inference.model import Step, StepResult, StereoModel
 from vergence_service.memory import MemoryBudget
 from vergence_service.metrics import Metrics
+from vergence_service.threads import Cost
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +41,7 @@ class _Waiting:
     live_stream: str | None
     timings: Timings
     answer: asyncio.Future[tuple[StepResult, Timings]]
+    cost: Cost
 
     @property
     def shape_of_work(self) -> tuple[object, ...]:
@@ -114,10 +116,12 @@ class StepBatcher:
         timings: Timings | None = None,
         deadline_s: float | None = None,
         live_stream: str | None = None,
+        cost: Cost | None = None,
     ) -> tuple[StepResult, Timings]:
         """Run one step; return its result, and ``timings`` extended by the wait and the model.
 
-        ``live_stream`` is the id of the step's live stream, or None if the step is not live.
+        ``live_stream`` is the id of the step's live stream, or None if the step is not live. What
+        the step takes of the processor, or of the device, is added to ``cost``.
 
         Raises FrameStale if the model was not free before ``deadline_s``, ModelFailed or NonFinite
         if the model failed, and Draining if the batcher ends first.
@@ -126,7 +130,9 @@ class StepBatcher:
         answer: asyncio.Future[tuple[StepResult, Timings]]
         answer = asyncio.get_running_loop().create_future()
         self._waiting.append(
-            _Waiting(step, now_s, deadline_s, live_stream, timings or Timings(), answer)
+            _Waiting(
+                step, now_s, deadline_s, live_stream, timings or Timings(), answer, cost or Cost()
+            )
         )
         if live_stream is not None:
             self._arrivals.arrived(live_stream, now_s)
@@ -213,8 +219,9 @@ class StepBatcher:
         started_s = self._clock()
         steps = [item.step for item in batch]
         loop = asyncio.get_running_loop()
+        used = Cost()
         try:
-            results = await loop.run_in_executor(self._threads, self._model.step, steps)
+            results = await loop.run_in_executor(self._threads, used.of, self._model.step, steps)
         except Exception as error:
             if len(batch) == 1:
                 _fail(batch[0], error)
@@ -223,6 +230,11 @@ class StepBatcher:
             for item in _unanswered(batch):
                 await self._step_together([item])
             return
+        finally:
+            # A device works while the thread waits, and a step may use the threads of other lanes.
+            used_s = max(used.seconds, (self._clock() - started_s) / self._lanes)
+            for item in batch:
+                item.cost.seconds += used_s / len(batch)
         model_s = self._clock() - started_s
         self._note_duration(batch[0].shape_of_work, model_s)
         self._metrics.batch_size.observe(len(batch))

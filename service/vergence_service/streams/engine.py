@@ -35,7 +35,7 @@ from vergence_service.streams.search_window import SearchReach
 from vergence_service.streams.stream import Attachment, Notice, NoticeKind, Stream, StreamConfig
 from vergence_service.streams.table import StreamTable
 from vergence_service.streams.turns import Turns
-from vergence_service.threads import ThreadPool, Threads
+from vergence_service.threads import Cost, ThreadPool, Threads
 
 # A client that comes while the model loads waits for at most this long. It is below the time that
 # the SDK waits for a stream to open, 5 s.
@@ -85,7 +85,7 @@ class DepthEngine:
         self._sizes = sizes
         self._iterations = iterations
         self._cold_iterations = cold_iterations
-        self._limits = limits
+        self.continuity = limits  # beyond which a frame starts cold
         self._reach = SearchReach(self.card.max_disparity_px, min_range_share)
         self._clock = clock
         self._phase = _Phase.LOADING
@@ -110,11 +110,6 @@ class DepthEngine:
     def provider(self) -> str:
         """The execution provider of the model."""
         return self._model.provider
-
-    @property
-    def continuity(self) -> ContinuityLimits:
-        """The limits beyond which a frame starts without a state."""
-        return self._limits
 
     async def start(self) -> None:
         """Load what live streams need, and accept streams.
@@ -204,6 +199,7 @@ class DepthEngine:
         decode: Callable[[], StereoFrame],
         *,
         arrived_s: float,
+        cost: Cost,
         max_age_s: float | None = None,
         owner: str = LOCAL.name,
     ) -> SteppedFrame:
@@ -211,7 +207,7 @@ class DepthEngine:
 
         ``decode`` runs in a worker thread when it is the frame's turn, so a frame that is displaced
         before that is never decoded. The caller makes the disparity map from the stepped frame, in
-        the thread that also encodes it.
+        the thread that also encodes it. The time of decoding and of the step is added to ``cost``.
 
         Raises what ``decode`` raises; UnknownStream or StreamExpired if the stream is gone;
         BadShape, FrameOutOfOrder or FrameStale if the frame is refused; ModelFailed; Draining; and
@@ -221,7 +217,12 @@ class DepthEngine:
         self.streams.touch(stream)
         try:
             return await self._step(
-                stream, decode, self.threads.live, arrived_s=arrived_s, max_age_s=max_age_s
+                stream,
+                decode,
+                self.threads.live,
+                arrived_s=arrived_s,
+                cost=cost,
+                max_age_s=max_age_s,
             )
         finally:
             self.streams.touch(stream)  # a step may take longer than the idle timeout
@@ -250,18 +251,10 @@ class DepthEngine:
             if not self.card.recurrent:
                 state = None
             origin = Origin.COLD_START if state is None else Origin.WARM
-            yield Stream(
-                "",
-                "",
-                b"",
-                config,
-                rectifier,
-                memory,
-                None,
-                self._clock(),
-                state=state,
-                origin=origin,
-            )
+            now_s = self._clock()
+            stream = Stream("", "", b"", config, rectifier, memory, None, now_s)
+            stream.state, stream.origin = state, origin
+            yield stream
 
     async def step_offline(
         self, stream: Stream, decode: Callable[[], StereoFrame]
@@ -271,11 +264,9 @@ class DepthEngine:
         Raises what ``decode`` raises, BadShape or FrameOutOfOrder if the frame is refused,
         ModelFailed, NonFinite and Draining.
         """
-        background = self.threads.background
-        stepped = await self._step(
-            stream, decode, background, arrived_s=self._clock(), max_age_s=None
-        )
-        return await background.run(stepped.disparity_map), stepped.result.state
+        pool, now_s = self.threads.background, self._clock()
+        stepped = await self._step(stream, decode, pool, arrived_s=now_s, cost=Cost())
+        return await pool.run(stepped.disparity_map), stepped.result.state
 
     async def reset(self, stream_id: str, *, owner: str = LOCAL.name) -> None:
         """Let later frames start without a state. Raises UnknownStream, StreamExpired."""
@@ -351,7 +342,8 @@ class DepthEngine:
         pool: ThreadPool,
         *,
         arrived_s: float,
-        max_age_s: float | None,
+        cost: Cost,
+        max_age_s: float | None = None,
     ) -> SteppedFrame:
         # The lock wakes its waiters in order. So a stream takes its frames one at a time as they
         # arrived, and no batch ever holds two frames of one stream.
@@ -359,10 +351,10 @@ class DepthEngine:
             try:
                 started_s = self._clock()
                 skipped = stream.frames_skipped
-                frame, view = await pool.run(decoded_view, decode, stream)
+                frame, view = await pool.run(cost.of, decoded_view, decode, stream)
                 decode_s = self._clock() - started_s
                 stream.check_order(frame.frame_id)
-                state, origin = stream.state_before(view, self._limits)
+                state, origin = stream.state_before(view, self.continuity)
                 iterations = self._iterations_of(stream.config, cold=state is None)
                 live = stream.config.delivery is Delivery.NEWEST
                 result, timings = await self._batcher.step(
@@ -370,6 +362,7 @@ class DepthEngine:
                     timings=Timings(decode_s=decode_s, queue_s=started_s - arrived_s),
                     deadline_s=None if max_age_s is None else arrived_s + max_age_s,
                     live_stream=stream.key if live else None,
+                    cost=cost,
                 )
             except DepthError as error:
                 self.count_failed(stream, error)

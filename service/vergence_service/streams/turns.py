@@ -5,12 +5,13 @@ old as one step and one frame of the camera, however many streams wait.
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from functools import partial
 
 from vergence_service.access.principals import Principal
+from vergence_service.threads import Cost
 
 # Steps that are so many times longer than those of others, and longer than this, leave a lane to
 # the others: they could have no turn meanwhile.
@@ -23,13 +24,17 @@ _NOTICE_S = 0.06
 _SMOOTHING = 0.2
 # Who uses less than its share may be so far behind the others, and gets its turns at once.
 _MOST_BEHIND_S = 0.5
+# Who takes long steps may be so far ahead of a stream that could use more. That stream may be
+# without a turn for so long, while its answer is encoded.
+_MOST_AHEAD_S = 0.02
+_RETURN_S = 0.05
 _FOREVER_S = 1e9
 _TICKS = 4  # of the event loop, until a stream that had a turn has asked for the next
 
 
 @dataclass(slots=True, eq=False)
 class _Account:
-    """What a principal, or one of its streams, has used: seconds of the model over its weight."""
+    """What a principal, or one of its streams, has used: seconds of work over its weight."""
 
     used_s: float
     seen_s: float  # time of the last turn, or wait for one
@@ -37,12 +42,17 @@ class _Account:
 
 @dataclass(slots=True, eq=False)
 class _StreamAccount(_Account):
-    cost_s: float = 0.0  # of a step, lately
+    cost_s: float = 0.0  # of a turn, lately
+    last: "Turn | None" = None
 
 
 @dataclass(slots=True, eq=False)
 class Turn:
-    """A turn of one stream. ``cost_s`` is to be set to the time that its step took."""
+    """A turn of one stream. The time that its work takes is to be added to ``cost``.
+
+    ``wants_more`` if its frame was there before the stream could take it: more turns would give
+    the stream more answers.
+    """
 
     stream: str
     owner: Principal
@@ -50,16 +60,21 @@ class Turn:
     granted: "asyncio.Future[None]"
     since_s: float
     expected_s: float = 0.0
-    cost_s: float = 0.0
-    noticed: bool = field(default=False)
+    cost: Cost = field(default_factory=Cost)
+    wants_more: bool = True
+    noticed: bool = False
+    ended_s: float | None = None
 
 
 class Turns:
     """Grants turns, as many at once as ``places``.
 
-    The next turn goes to the principal that has used the least time of the model for its weight,
-    and there to the stream that has used the least. Who did not want a turn for a while does not
-    save up for later.
+    The next turn goes to the principal that has used the least time for its weight, and there to
+    the stream that has used the least. Time is that of decoding, of the model and of encoding. Who
+    did not want a turn for a while does not save up for later.
+
+    A place is no right to a long step: the threads of all places share the processor. A stream with
+    long steps waits while one that has used less has its turn, or just had it, and could use more.
     """
 
     def __init__(self, *, places: int, lanes: int, clock: Callable[[], float]) -> None:
@@ -82,7 +97,12 @@ class Turns:
 
     @asynccontextmanager
     async def turn(
-        self, stream: str, owner: Principal, *, on_soon: Callable[[], None]
+        self,
+        stream: str,
+        owner: Principal,
+        *,
+        on_soon: Callable[[], None],
+        wants_more: bool = True,
     ) -> AsyncIterator[Turn]:
         """Wait for a turn of a stream; it lasts as long as the block.
 
@@ -90,7 +110,7 @@ class Turns:
         """
         now_s = self._clock()
         granted: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        turn = Turn(stream, owner, on_soon, granted, now_s)
+        turn = Turn(stream, owner, on_soon, granted, now_s, wants_more=wants_more)
         self._enter(turn, now_s)
         self._waiting.append(turn)
         self._grant()
@@ -103,6 +123,11 @@ class Turns:
             else:
                 self._end(turn)
             self._grant_soon()
+
+    def charge(self, stream: str, owner: Principal, seconds: float) -> None:
+        """Charge work that was done for a stream after its turn."""
+        if owner.name in self._principals:
+            self._charge(stream, owner, seconds)
 
     def _enter(self, turn: Turn, now_s: float) -> None:
         """Open the accounts of a turn, or bring them up to date."""
@@ -130,12 +155,17 @@ class Turns:
         while len(self._running) < self._places and (turn := self._next()) is not None:
             self._waiting.remove(turn)
             self._running.append(turn)
+            if (account := self._streams.get(turn.stream)) is not None:
+                account.last = turn
             # As if it had ended already: the next choice must know of it.
-            self._charge(turn, turn.expected_s)
+            self._charge(turn.stream, turn.owner, turn.expected_s)
             self._notice(turn)
             if not turn.granted.done():
                 turn.granted.set_result(None)
         self._notice_those_near()
+        if self._waiting and not self._running:
+            # Held back for a stream that may return; nobody else would ask.
+            asyncio.get_running_loop().call_later(_RETURN_S, self._grant)
 
     def _order(self, turn: Turn) -> tuple[float, float, float]:
         principal = self._principals[turn.owner.name].used_s
@@ -146,9 +176,34 @@ class Turns:
         long_s = self._long_s()
         long = sum(each.expected_s > long_s for each in self._running)
         allowed = [
-            each for each in self._waiting if long < self._long_places or each.expected_s <= long_s
+            each
+            for each in self._waiting
+            if each.expected_s <= long_s
+            or (long < self._long_places and not self._in_the_way(each))
         ]
         return min(allowed, key=self._order, default=None)
+
+    def _in_the_way(self, turn: Turn) -> bool:
+        """Decide whether a stream has used more than one that could use more just now."""
+        now_s = self._clock()
+        for other in [each.last for each in self._streams.values()]:
+            if (
+                other is not None
+                and other.wants_more
+                and (other.ended_s is None or now_s - other.ended_s <= _RETURN_S)
+                and self._ahead_s(turn, other) > _MOST_AHEAD_S
+            ):
+                return True
+        return False
+
+    def _ahead_s(self, turn: Turn, other: Turn) -> float:
+        accounts: Mapping[str, _Account] = self._streams
+        mine, others = turn.stream, other.stream
+        if turn.owner.name != other.owner.name:
+            accounts, mine, others = self._principals, turn.owner.name, other.owner.name
+        if mine not in accounts or others not in accounts:  # closed, or not seen for long
+            return 0.0
+        return accounts[mine].used_s - accounts[others].used_s
 
     def _long_s(self) -> float:
         """Return the time above which a step is long beside those of the streams of late."""
@@ -179,13 +234,13 @@ class Turns:
 
     def _end(self, turn: Turn) -> None:
         self._running.remove(turn)
-        now_s = self._clock()
-        self._charge(turn, turn.cost_s - turn.expected_s)
+        turn.ended_s = now_s = self._clock()
+        self._charge(turn.stream, turn.owner, turn.cost.seconds - turn.expected_s)
         self._principals[turn.owner.name].seen_s = now_s
-        if turn.cost_s and (stream := self._streams.get(turn.stream)) is not None:
+        if turn.cost.seconds and (stream := self._streams.get(turn.stream)) is not None:
             stream.seen_s = now_s
-            known_s = stream.cost_s or turn.cost_s
-            stream.cost_s = known_s + _SMOOTHING * (turn.cost_s - known_s)
+            known_s = stream.cost_s or turn.cost.seconds
+            stream.cost_s = known_s + _SMOOTHING * (turn.cost.seconds - known_s)
         between_s = now_s - self._last_end_s
         self._last_end_s = now_s
         if self._waiting:  # else the pause says nothing about the model
@@ -193,10 +248,10 @@ class Turns:
             self._interval_s = known_s + _SMOOTHING * (between_s - known_s)
         self._forget_old(now_s)
 
-    def _charge(self, turn: Turn, seconds: float) -> None:
-        self._principals[turn.owner.name].used_s += seconds / turn.owner.weight
-        if (stream := self._streams.get(turn.stream)) is not None:
-            stream.used_s += seconds
+    def _charge(self, stream: str, owner: Principal, seconds: float) -> None:
+        self._principals[owner.name].used_s += seconds / owner.weight
+        if (account := self._streams.get(stream)) is not None:
+            account.used_s += seconds
 
     def _forget_old(self, now_s: float) -> None:
         here = {each.owner.name for each in (*self._waiting, *self._running)}

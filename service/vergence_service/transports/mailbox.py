@@ -61,6 +61,11 @@ class Mailbox:
             self._changed.notify_all()
             return displaced
 
+    @property
+    def holds_frame(self) -> bool:
+        """True while a frame waits."""
+        return bool(self._frames)
+
     def reset(self) -> None:
         """Mark the next frame: the stream starts again without a state before it."""
         self._reset_asked = True

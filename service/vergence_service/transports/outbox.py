@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 
 from vergence_proto import codec
 from vergence_proto.v1 import depth_pb2 as pb
+from vergence_service.access.principals import Principal
 from vergence_service.failures import out_of_memory
 from vergence_service.metrics import Metrics
 from vergence_service.streams.conversion import SteppedFrame
 from vergence_service.streams.stream import Notice, NoticeKind
-from vergence_service.threads import ThreadPool
+from vergence_service.threads import Cost, ThreadPool
 
 # One map is encoded and sent while the next is stepped. Beyond that the stepper waits for the
 # client to read, and newer frames displace older ones in the mailbox.
@@ -37,7 +38,11 @@ class _Ping:
 
 
 class Outbox:
-    """A queue of answers: several tasks put, one sends in order. Threads encode the maps."""
+    """A queue of answers: several tasks put, one sends in order. Threads encode the maps.
+
+    ``on_encoded`` is called with the key and the owner of a map's stream, and with the processor's
+    time for the map in seconds.
+    """
 
     def __init__(
         self,
@@ -46,9 +51,11 @@ class Outbox:
         clock: Callable[[], float],
         metrics: Metrics,
         threads: ThreadPool,
+        on_encoded: Callable[[str, Principal, float], None],
     ) -> None:
         self._write = write
         self._threads = threads
+        self._on_encoded = on_encoded
         self._clock = clock
         self._metrics = metrics
         self._answers: asyncio.Queue[pb.StreamDepthResponse | _Map | _Ping | None]
@@ -99,7 +106,10 @@ class Outbox:
         while (answer := await self._answers.get()) is not None:
             match answer:
                 case _Map(stepped, map_step):
-                    await self._write(await self._threads.run(self._encoded, stepped, map_step))
+                    cost = Cost()
+                    response = await self._threads.run(cost.of, self._encoded, stepped, map_step)
+                    self._on_encoded(stepped.stream.key, stepped.stream.owner, cost.seconds)
+                    await self._write(response)
                     self._unsent.release()
                 case _Ping(client_ns, arrived_s):
                     hold_ns = int((self._clock() - arrived_s) * 1e9)

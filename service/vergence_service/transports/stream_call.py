@@ -16,7 +16,7 @@ from vergence_service.logs import log_event
 from vergence_service.streams.conversion import SteppedFrame
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.stream import Notice, Stream, StreamConfig
-from vergence_service.streams.turns import Turn
+from vergence_service.threads import Cost
 from vergence_service.transports.displaced import DisplacedFrames
 from vergence_service.transports.mailbox import Mailbox, QueuedFrame
 from vergence_service.transports.outbox import Outbox
@@ -27,6 +27,8 @@ log = logging.getLogger(__name__)
 # ``write_s`` is the time for answers up to this size. Larger ones have more time, in proportion.
 _USUAL_BYTES = 1 << 20
 _SLOWEST_READER_BYTES_S = 64 << 10
+# What it costs to receive an image: a stream is charged for it, also for frames that it floods.
+_RECEIVING_S_PER_BYTE = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,7 +76,11 @@ class DepthCall:
         self._limits = limits
         self._clock = clock
         self._outbox = Outbox(
-            self._write_in_time, clock=clock, metrics=engine.metrics, threads=engine.threads.live
+            self._write_in_time,
+            clock=clock,
+            metrics=engine.metrics,
+            threads=engine.threads.live,
+            on_encoded=engine.turns.charge,
         )
         self._displaced = DisplacedFrames(self._outbox, on_reported=self._answered)
         self._reader: asyncio.Task[None] | None = None
@@ -290,6 +296,8 @@ class DepthCall:
     ) -> None:
         self._owed += 1
         self._overran = self._overran or self._owed > self._most_unanswered
+        receiving_s = frame.nbytes * _RECEIVING_S_PER_BYTE
+        self._engine.turns.charge(stream.key, stream.owner, receiving_s)
         rig = stream.rectifier.rig
         try:
             codec.check_frame(
@@ -329,35 +337,36 @@ class DepthCall:
     async def _step(self, stream: Stream, mailbox: Mailbox) -> None:
         while True:
             await self._outbox.reserve_map()
+            waited = mailbox.holds_frame
             if not await mailbox.filled():
                 await self._displaced.report()
                 return
-            async with self._turn(stream) as turn:
+            async with self._turn(stream, wants_more=waited) as cost:
                 queued = await mailbox.take()
                 if queued is None:
                     return
-                stepped = await self._stepped(stream, queued)
-                if turn is not None and stepped is not None:
-                    turn.cost_s = stepped.timings.model_s
+                stepped = await self._stepped(stream, queued, cost)
             # Not in the turn: the client may be slow to read.
             if stepped is not None:
                 await self._outbox.put_map(stepped, map_step=queued.frame.fields.map_step)
                 self._answered()
 
     @asynccontextmanager
-    async def _turn(self, stream: Stream) -> AsyncIterator[Turn | None]:
+    async def _turn(self, stream: Stream, *, wants_more: bool) -> AsyncIterator[Cost]:
         """Wait for a turn of a live stream. The steps of others run in the gaps."""
         if stream.config.delivery is not Delivery.NEWEST:
-            yield None
+            yield Cost()
             return
         self._displaced.wait()
         async with self._engine.turns.turn(
-            stream.key, stream.owner, on_soon=self._displaced.report_now
+            stream.key, stream.owner, on_soon=self._displaced.report_now, wants_more=wants_more
         ) as turn:
             self._displaced.begin()
-            yield turn
+            yield turn.cost
 
-    async def _stepped(self, stream: Stream, queued: QueuedFrame) -> SteppedFrame | None:
+    async def _stepped(
+        self, stream: Stream, queued: QueuedFrame, cost: Cost
+    ) -> SteppedFrame | None:
         """Step a frame; None if it failed and was answered with the error."""
         size = stream.rectifier.rig.width, stream.rectifier.rig.height
         fields = queued.frame.fields
@@ -368,6 +377,7 @@ class DepthCall:
                 stream.stream_id,
                 partial(codec.decode_frame, queued.frame, size=size),
                 arrived_s=queued.arrived_s,
+                cost=cost,
                 owner=stream.owner.name,
                 max_age_s=fields.max_age_s if fields.HasField("max_age_s") else None,
             )
