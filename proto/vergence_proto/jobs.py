@@ -45,6 +45,20 @@ class JobOutput(StrEnum):
     """Points in the world, coloured by the left image, which is kept too."""
 
 
+class Quality(StrEnum):
+    """What a job does beyond one step a frame. Each price was measured beside ``fast``.
+
+    Frames without poses gain nothing from more than ``fast``: each is a cold start already.
+    """
+
+    FAST = "fast"
+    """One step a frame, each from the state of the frame before."""
+    STEADY = "steady"
+    """A second pass backward in time, fused with the first: less flicker, twice the time."""
+    BEST = "best"
+    """The same and a closer look at every frame by itself: fewest errors, ten times the time."""
+
+
 class OnError(StrEnum):
     """What a bad frame does to its job."""
 

@@ -177,14 +177,20 @@ async def test_accuracy_is_progress_seen_where_the_archive_has_the_truth() -> No
 
 
 async def test_iterations_are_those_asked_for() -> None:
-    frames = FRAMES[:2]
     async with http_server(IterationsModel()) as client:
-        job = await submit(client, zip_bytes(sequence_files(frames)), iterations=4)
-        await ended(client, job["id"])
-        assert [float(each[0, 0]) for each in await disparities(client, job["id"])] == [4, 4]
-        job = await submit(client, zip_bytes(sequence_files(frames)))
+        job = await submit(client, zip_bytes(sequence_files(FRAMES[:2])))
         await ended(client, job["id"])
         assert [float(each[0, 0]) for each in await disparities(client, job["id"])] == [4, 1]
+        pair = {"left.png": png(FRAMES[0].left), "right.png": png(FRAMES[0].right)}
+        files = {**pair, "calib.json": json.dumps(CALIBRATION).encode()}
+        job = await submit(client, zip_bytes(files.items()), iterations=1)
+        await ended(client, job["id"])
+        assert [float(each[0, 0]) for each in await disparities(client, job["id"])] == [1]
+        refused = await client.post(
+            "/v1/sequences", params={"iterations": 4}, content=ARCHIVE, headers=ZIP
+        )
+        assert reason_of(refused) == "BAD_SHAPE"
+        assert "quality=best" in refused.json()["detail"]
 
 
 class IterationsModel(RecallModel):

@@ -24,7 +24,7 @@ from vergence.cli.options import (
 from vergence.transports.addresses import DEFAULT_SERVER
 from vergence.transports.credentials import use_files
 from vergence_proto.errors import DepthError
-from vergence_proto.jobs import MAP_FORMATS, JobOutput, OnError, Output, ResultFormat
+from vergence_proto.jobs import MAP_FORMATS, JobOutput, OnError, Output, Quality, ResultFormat
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -268,8 +268,11 @@ def _batch(
         OnError, typer.Option(help="What a frame does that cannot be read or stepped.")
     ] = OnError.SKIP,
     iterations: Annotated[
-        int, typer.Option(min=0, help="Refinement iterations per frame; 0: the server's default.")
+        int, typer.Option(min=0, help="Iterations of a single pair; 0: the server's default.")
     ] = 0,
+    quality: Annotated[
+        Quality, typer.Option(help="steady: less flicker, 2 x the time; best: fewer errors, 10 x.")
+    ] = Quality.FAST,
     metrics: Annotated[
         bool, typer.Option("--metrics", help="Compare with the ground truth, if there is any.")
     ] = False,
@@ -287,6 +290,7 @@ def _batch(
             query={
                 "output": [each.value for each in output],
                 "iterations": iterations,
+                "quality": quality.value,
                 "metrics": metrics,
                 "on_error": on_error.value,
             },

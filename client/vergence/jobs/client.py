@@ -97,6 +97,7 @@ class AsyncBatchClient:
         labels: Mapping[str, str] | None = None,
         on_error: Literal["skip", "fail"] = "skip",
         iterations: int = 0,
+        quality: Literal["fast", "steady", "best"] = "fast",
         metrics: bool = False,
         rig: RectifiedRig | None = None,
         fps: float = 30.0,
@@ -118,7 +119,11 @@ class AsyncBatchClient:
             "skip": a frame that cannot be read or stepped only costs itself; "fail": it ends the
             job, which keeps the frames before.
         iterations
-            Refinement iterations of every step; 0: the server's default, which is best.
+            Refinement iterations of a single pair; 0: the server's default.
+        quality
+            "steady": a second pass backward in time for less flicker, at twice the time; "best":
+            also a closer look at every frame, for fewer errors at ten times the time. Both need
+            poses.
         metrics
             Compare with the ground truth of the sequence.
         rig, fps
@@ -139,6 +144,7 @@ class AsyncBatchClient:
             "label": [f"{key}:{value}" for key, value in (labels or {}).items()],
             "on_error": on_error,
             "iterations": iterations,
+            "quality": quality,
             "metrics": metrics,
         }
         with ExitStack() as stack:

@@ -57,6 +57,7 @@ def manifest_of(status: JobStatus, folder: Path) -> dict[str, Any]:
         "options": {
             "output": [each.value for each in job.options.outputs],
             "iterations": job.options.iterations,
+            "quality": job.options.quality.value,
             "metrics": job.options.metrics,
             "on_error": job.options.on_error.value,
         },

@@ -9,7 +9,7 @@ import numpy as np
 
 from vergence_proto.datasets import StereoSource
 from vergence_proto.datasets.source import FrameFiles
-from vergence_proto.jobs import WarningKind
+from vergence_proto.jobs import Quality, WarningKind
 from vergence_service.jobs.job import JobWarning
 from vergence_service.jobs.sources import relative_text
 from vergence_service.streams.continuity import ContinuityLimits
@@ -17,6 +17,8 @@ from vergence_service.streams.continuity import ContinuityLimits
 # A cold start has more iterations and looks closer: python tests/benchmarks/batch_throughput.py
 COLD_WORK = 8.0
 _NAMED_AT_MOST = 20
+# A pass backward steps some frames twice, see ``passes``.
+_EXTRA_WORK = {Quality.FAST: 0.0, Quality.STEADY: 1.2, Quality.BEST: 1.2 + COLD_WORK}
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +70,11 @@ def forecast(
     notes = (relative_text(note, folder) for note in sequence.notes)
     warnings += [JobWarning(WarningKind.DATA, note) for note in notes]
     return Forecast(cold, tuple(warnings))
+
+
+def extra_work(quality: Quality) -> float:
+    """Return the work of a frame beyond its one step, in warm steps."""
+    return _EXTRA_WORK[quality]
 
 
 def _cold_frames(files: Sequence[FrameFiles], limits: ContinuityLimits) -> int:

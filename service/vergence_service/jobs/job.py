@@ -6,17 +6,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from vergence_proto.jobs import JobOutput, JobState, OnError, WarningKind
+from vergence_proto.jobs import JobOutput, JobState, OnError, Quality, WarningKind
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobOptions:
     """The options of a submission."""
 
-    iterations: int = 0  # iterations of every step; 0: the server's defaults
+    iterations: int = 0  # iterations of a single pair; 0: the server's default
     outputs: tuple[JobOutput, ...] = (JobOutput.DISPARITY,)
     metrics: bool = False  # compare with the ground truth, if the upload has any
     on_error: OnError = OnError.SKIP  # what a bad frame does
+    quality: Quality = Quality.FAST
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +80,7 @@ def job_from_json(document: str) -> Job:
     values: dict[str, Any] = json.loads(document)  # as job_to_json wrote it
     known = {each.name for each in fields(Job)}
     values = {name: value for name, value in values.items() if name in known}
-    options = {"on_error": OnError.SKIP, **values.pop("options")}
+    options = {"on_error": OnError.SKIP, "quality": Quality.FAST, **values.pop("options")}
     warnings = values.pop("warnings", [])  # jobs of older servers have none
     return Job(
         **{
@@ -92,6 +93,7 @@ def job_from_json(document: str) -> Job:
                     **options,
                     "outputs": tuple(map(JobOutput, options["outputs"])),
                     "on_error": OnError(options["on_error"]),
+                    "quality": Quality(options["quality"]),
                 }
             ),
         }

@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from vergence_service.jobs.forecast import COLD_WORK
+from vergence_service.jobs.forecast import COLD_WORK, extra_work
 from vergence_service.jobs.job import Job
 
 
@@ -16,7 +16,8 @@ def work_until(job: Job, frames: int) -> float:
     if not frames:
         return 0.0
     others = max(job.cold_expected - 1, 0) * (frames - 1) / max(job.frames - 1, 1)
-    return job.megapixels * (frames + (COLD_WORK - 1) * (1 + others))
+    steps = frames * (1 + extra_work(job.options.quality))
+    return job.megapixels * (steps + (COLD_WORK - 1) * (1 + others))
 
 
 @dataclass(slots=True, eq=False)

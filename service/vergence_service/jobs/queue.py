@@ -1,5 +1,6 @@
 """The admission of sequences: limits, checks of the upload, and the end of a job on request."""
 
+import dataclasses
 import logging
 import secrets
 import time
@@ -9,12 +10,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
 
-from vergence_proto.errors import BadSequence, InsufficientStorage, QueueFull, Quota
-from vergence_proto.jobs import OnError
+from vergence_proto.errors import BadSequence, BadShape, InsufficientStorage, QueueFull, Quota
+from vergence_proto.jobs import JobOutput, OnError, Quality
 from vergence_service.access.principals import LOCAL, Principal
 from vergence_service.jobs.forecast import forecast
 from vergence_service.jobs.job import Job, JobOptions
 from vergence_service.jobs.kept_uploads import KeptUploads
+from vergence_service.jobs.passes import BLOCK
 from vergence_service.jobs.progress import JobStatus
 from vergence_service.jobs.registry import JobRegistry
 from vergence_service.jobs.results import read_records, result_bytes
@@ -159,6 +161,12 @@ class JobQueue:
         if unreadable and options.on_error is OnError.FAIL:
             raise BadSequence(unreadable[0])
         chosen, sequence = await self.threads.run(find_sequence, upload, order.source)
+        if options.iterations and not sequence.is_single_pair:
+            raise BadShape(
+                "iterations is for a single pair: the network was trained for steps of "
+                "model.iterations, and more of them make a sequence slower and worse; "
+                "leave it out, and use quality=steady or quality=best"
+            )
         # Refuse now what could not be opened when the job runs.
         await self._engine.check_offline(job_stream_config(sequence, options))
         await self.threads.run(check_readable, sequence, upload)
@@ -170,6 +178,9 @@ class JobQueue:
         )
         uploaded = await self.threads.run(folder_bytes, folder)
         result = result_bytes(sequence, options.outputs)
+        if options.quality is not Quality.FAST:
+            passes = dataclasses.replace(sequence, files=sequence.files[:BLOCK])
+            uploaded += result_bytes(passes, [JobOutput.DISPARITY, JobOutput.SIGMA])
         job = Job(
             job_id=secrets.token_hex(16),  # without a credential, it is all that protects a job
             source=chosen,

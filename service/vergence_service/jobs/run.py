@@ -22,6 +22,7 @@ from vergence_proto.types import Delivery, OutputFormat
 from vergence_service.jobs.checkpoints import Checkpoint, read_checkpoint, write_checkpoint
 from vergence_service.jobs.job import Job, JobOptions
 from vergence_service.jobs.left_image import left_image
+from vergence_service.jobs.passes import step_passes
 from vergence_service.jobs.progress import JobProgress
 from vergence_service.jobs.results import (
     Made,
@@ -32,7 +33,7 @@ from vergence_service.jobs.results import (
     write_made,
 )
 from vergence_service.jobs.sources import open_below, relative_text, sequence_error
-from vergence_service.jobs.stepping import Skipped, Stepped, step_all
+from vergence_service.jobs.stepping import Skipped, Stepped
 from vergence_service.jobs.storage import disk_trouble
 from vergence_service.jobs.tally import FrameCounts
 from vergence_service.streams.engine import DepthEngine
@@ -43,6 +44,7 @@ from vergence_service.threads import ThreadPool
 # Frames that are being written while the next ones are stepped.
 _UNWRITTEN = 2
 CHECKPOINT = "checkpoint"
+PASSES = "passes"
 
 
 def job_stream_config(sequence: StereoSource, options: JobOptions) -> StreamConfig:
@@ -115,7 +117,16 @@ async def run_job(
     try:
         async with (
             aclosing(
-                step_all(engine, sequence, config, start=start, state=state, may_skip=may_skip)
+                step_passes(
+                    engine,
+                    sequence,
+                    config,
+                    job.options.quality,
+                    folder / PASSES,
+                    start=start,
+                    state=state,
+                    may_skip=may_skip,
+                )
             ) as steps,
             aclosing(_started(writer.result, engine, steps, background, start)) as started,
             # No thread writes any more when this is closed. Then the folder can be removed.

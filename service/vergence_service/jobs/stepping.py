@@ -1,5 +1,7 @@
 """Step a whole sequence: a pure function of its frames and the model."""
 
+import asyncio
+import dataclasses
 from collections.abc import AsyncGenerator, Callable
 from contextlib import aclosing
 from dataclasses import dataclass
@@ -8,7 +10,7 @@ from functools import partial
 from vergence_proto.datasets import DatasetError, SourceFrame, StereoSource, read_ahead
 from vergence_proto.errors import BadShape, DepthError, NonFinite
 from vergence_proto.ordered import in_order
-from vergence_proto.types import DisparityMap
+from vergence_proto.types import DisparityMap, Origin
 from vergence_service.inference.model import RecurrentState
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.rectify import Rectifier
@@ -30,6 +32,7 @@ class Stepped:
     state: RecurrentState  # state after this frame
     rectifier: Rectifier
     note: DatasetError | None = None  # what is wrong with its ground truth
+    alone: DisparityMap | None = None  # the map without a state, if it was asked for
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,11 +58,13 @@ async def step_all(
     start: int = 0,
     state: RecurrentState | None = None,
     may_skip: Callable[[DatasetError | DepthError], bool] = lambda _: False,
+    alone: bool = False,
 ) -> AsyncGenerator[Stepped | Skipped, None]:
     """Step the frames of ``sequence`` in order, each from the state after the frame before.
 
     Stepping begins at frame ``start``, from ``state``, the state after the frame before it. A frame
-    that cannot be read or stepped is skipped if ``may_skip`` allows it for the error.
+    that cannot be read or stepped is skipped if ``may_skip`` allows it for the error. With
+    ``alone``, each frame is stepped a second time without a state.
 
     Raises NotReady or Draining if the server accepts no work; BadCalibration, FrameTooLarge or
     ModelFailed if a frame cannot be stepped; and what ``may_skip`` does not allow: DatasetError if
@@ -68,9 +73,9 @@ async def step_all(
     async with (
         engine.offline(config, state=state) as stream,
         aclosing(_reading(engine, sequence, start, may_skip)) as frames,
-        aclosing(in_order(frames, partial(_step, engine, stream, may_skip), limit=_IN_FLIGHT)) as (
-            steps
-        ),
+        aclosing(
+            in_order(frames, partial(_step, engine, stream, may_skip, alone), limit=_IN_FLIGHT)
+        ) as (steps),
     ):
         async for stepped in steps:
             yield stepped
@@ -106,14 +111,30 @@ async def _step(
     engine: DepthEngine,
     stream: Stream,
     may_skip: Callable[[DatasetError | DepthError], bool],
+    alone: bool,
     read: _Read | Skipped,
 ) -> Stepped | Skipped:
     if isinstance(read, Skipped):
         return read
     try:
         disparity, state = await engine.step_offline(stream, lambda: read.source.frame)
+        second = await _alone(engine, stream, read) if alone and state.step_count > 1 else None
     except FRAME_ERRORS as error:
         if not may_skip(error):
             raise
         return Skipped(read.index, error)
-    return Stepped(read.index, read.source, disparity, state, stream.rectifier, read.note)
+    return Stepped(read.index, read.source, disparity, state, stream.rectifier, read.note, second)
+
+
+async def _alone(engine: DepthEngine, stream: Stream, read: _Read) -> DisparityMap:
+    """Step a frame as if it were the first."""
+    first = dataclasses.replace(
+        stream,
+        state=None,
+        origin=Origin.COLD_START,
+        last_frame_id=0,
+        frames_skipped=0,
+        turn=asyncio.Lock(),
+    )
+    disparity, _ = await engine.step_offline(first, lambda: read.source.frame)
+    return disparity

@@ -5,6 +5,7 @@
     DIRECTORY/jobs.sqlite3        one row per job; a job is accepted when its row is committed
     DIRECTORY/incoming/ID/        uploads that are not accepted yet; removed at every start
     DIRECTORY/jobs/ID/input       the unpacked upload; removed when the job ends
+    DIRECTORY/jobs/ID/passes      maps to be fused; removed when the job ends
     DIRECTORY/jobs/ID/checkpoint  progress, see :mod:`vergence_service.jobs.checkpoints`
     DIRECTORY/jobs/ID/result      see :mod:`vergence_service.jobs.results`
 """
@@ -167,7 +168,8 @@ class JobStore:
 
     def tidy(self, job: Job) -> None:
         """Remove the files that an ended job does not need; the next start tries again."""
-        remove_folder(self.folder(job.job_id) / "input")
+        for name in ("input", "passes"):
+            remove_folder(self.folder(job.job_id) / name)
         with suppress(OSError):
             (self.folder(job.job_id) / "checkpoint").unlink(missing_ok=True)
 

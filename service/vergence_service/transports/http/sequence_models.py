@@ -6,7 +6,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from vergence_proto.errors import ErrorCode
-from vergence_proto.jobs import JobOutput, JobState, OnError, ResultFormat, WarningKind
+from vergence_proto.jobs import JobOutput, JobState, OnError, Quality, ResultFormat, WarningKind
 from vergence_service.jobs.progress import JobStatus
 from vergence_service.transports.http.pages import LABEL
 
@@ -26,6 +26,7 @@ _EXAMPLE: dict[str, JsonValue] = {
     "output": ["disparity"],
     "on_error": "skip",
     "iterations": 0,
+    "quality": "fast",
     "metrics": False,
     "accuracy": None,
     "frames_failed": 0,
@@ -55,7 +56,12 @@ class SubmitQuery(BaseModel):
     )
     model: str | None = Field(default=None, description="refuse unless the server runs this model")
     iterations: int = Field(
-        default=0, ge=0, le=64, description="iterations of every step; 0: the default"
+        default=0, ge=0, le=64, description="iterations of a single pair; 0: the default"
+    )
+    quality: Quality = Field(
+        default=Quality.FAST,
+        description="steady: a pass backward too, for less flicker at twice the time; best: and a "
+        "closer look at every frame, for fewer errors at ten times the time",
     )
     output: list[JobOutput] = Field(
         default=[JobOutput.DISPARITY],
@@ -111,6 +117,7 @@ class SequenceJob(BaseModel):
     output: list[JobOutput]
     on_error: OnError
     iterations: int
+    quality: Quality
     metrics: bool
     accuracy: dict[str, float] | None = Field(description="mean over the frames with ground truth")
     frames_failed: int = Field(
@@ -146,6 +153,7 @@ class SequenceJob(BaseModel):
             output=list(job.options.outputs),
             on_error=job.options.on_error,
             iterations=job.options.iterations,
+            quality=job.options.quality,
             metrics=job.options.metrics,
             accuracy=None if job.accuracy is None else dict(job.accuracy),
             frames_failed=job.frames_failed,

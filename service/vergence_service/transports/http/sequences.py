@@ -107,6 +107,7 @@ def sequence_routes(
             source=query.source,
             options=JobOptions(
                 iterations=query.iterations,
+                quality=query.quality,
                 outputs=_kept(query.output),
                 metrics=query.metrics,
                 on_error=query.on_error,
