@@ -54,8 +54,13 @@ class StreamMemory:
     step: int  # the peak of its largest step; several streams need it once
 
     @property
+    def own(self) -> int:
+        """What no other stream uses too."""
+        return self.state + self.work + self.maps
+
+    @property
     def total(self) -> int:
-        return self.state + self.work + self.maps + self.step
+        return self.own + self.step
 
 
 class MemoryHold:
@@ -78,6 +83,11 @@ class MemoryHold:
         trace: TracebackType | None,
     ) -> None:
         self.release()
+
+    @property
+    def nbytes(self) -> int:
+        """What is reserved, without steps."""
+        return sum(self._held.values())
 
     def grow(self, nbytes: int) -> None:
         """Reserve more, for a frame that still arrives. Raises StateMemory if it does not fit."""
@@ -137,7 +147,7 @@ class MemoryBudget:
         self.check_possible(need)
         steps = self.used(MemoryKind.STEPS)
         used = self._used_beside_steps() + steps
-        more = need.total - need.step + max(need.step - steps, 0)
+        more = need.own + max(need.step - steps, 0)
         if used + more > self._limit:
             raise StateMemory(
                 f"the stream needs {_mib(more)} of memory; {_mib(used)} of {_mib(self._limit)} are "

@@ -30,6 +30,7 @@ from vergence_service.streams import engine as engine_module
 from vergence_service.streams.continuity import ContinuityLimits
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.needs import ImageSizes
+from vergence_service.streams.quotas import Quotas
 from vergence_service.streams.stream import StreamConfig
 from vergence_service.streams.table import StreamTable
 from vergence_service.threads import Threads
@@ -120,7 +121,7 @@ async def not_started() -> AsyncIterator[DepthEngine]:
     batcher = StepBatcher(model, max_batch=1, memory=memory, clock=clock, metrics=metrics)
     streams = StreamTable(
         capacity=1,
-        per_client=None,
+        quotas=Quotas(),
         memory=memory,
         idle_timeout_s=60,
         idle_notice_s=10,

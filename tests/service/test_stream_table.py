@@ -21,6 +21,7 @@ from vergence_proto.errors import (
 from vergence_proto.types import StereoRig
 from vergence_service.memory import MemoryBudget, MemoryKind, StreamMemory
 from vergence_service.metrics import Metrics
+from vergence_service.streams.quotas import Quotas
 from vergence_service.streams.rectify import Rectifier
 from vergence_service.streams.stream import Notice, Stream, StreamConfig
 from vergence_service.streams.table import StreamTable
@@ -73,7 +74,7 @@ class StreamTableMachine(RuleBasedStateMachine):
         self.memory = MemoryBudget(MEMORY, metrics=metrics)
         self.table = StreamTable(
             capacity=CAPACITY,
-            per_client=PER_CLIENT,
+            quotas=Quotas(streams_per_client=PER_CLIENT),
             memory=self.memory,
             idle_timeout_s=IDLE_S,
             idle_notice_s=NOTICE_S,

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from vergence_proto.errors import Unauthenticated
 from vergence_service.access.principals import LOCAL, Principal, checked_name
+from vergence_service.access.requests import OpenRequests
 from vergence_service.access.tokens import Tokens
 
 _BEARER = "bearer "
@@ -13,7 +14,14 @@ _CERTIFICATE = "certificate:"
 class Gate:
     """Knows the tokens of a server, and whether its clients have certificates."""
 
-    def __init__(self, tokens: Tokens | None = None, *, certificates: bool = False) -> None:
+    def __init__(
+        self,
+        tokens: Tokens | None = None,
+        *,
+        certificates: bool = False,
+        most_requests: int | None = None,
+    ) -> None:
+        self.requests = OpenRequests(most_requests)
         self._tokens = tokens
         self._certificates = certificates
 

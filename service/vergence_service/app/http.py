@@ -130,6 +130,7 @@ async def serving_http(
                         checkpoint_s=batch.checkpoint_s,
                         keep_s=batch.keep_h * 3600,
                         disk_bytes=batch.disk_mib * _MIB,
+                        principal_bytes=settings.limits.sequences_mib * _MIB,
                     ),
                 )
             )

@@ -53,7 +53,11 @@ def make_gate(settings: Settings) -> Gate:
         tokens = None if chosen.tokens is None else Tokens(chosen.tokens)
     except TokenFileError as error:
         raise SettingsError(str(error)) from None
-    return Gate(tokens, certificates=chosen.client_ca is not None)
+    return Gate(
+        tokens,
+        certificates=chosen.client_ca is not None,
+        most_requests=settings.limits.requests,
+    )
 
 
 def make_certificate(settings: Settings) -> Certificate | None:

@@ -35,6 +35,7 @@ from vergence_service.settings import Settings
 from vergence_service.streams.continuity import ContinuityLimits
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.needs import ImageSizes
+from vergence_service.streams.quotas import Quotas
 from vergence_service.streams.stream import Stream
 from vergence_service.streams.table import StreamTable
 from vergence_service.streams.turns import Turns
@@ -127,8 +128,12 @@ async def running(
 
     streams = StreamTable(
         capacity=settings.streams.capacity,
-        per_client=settings.limits.streams_per_client,
-        per_principal=settings.limits.streams,
+        quotas=Quotas(
+            streams=settings.limits.streams,
+            state_bytes=settings.limits.state_mib * _MIB,
+            megapixels_per_s=settings.limits.megapixels_per_s,
+            streams_per_client=settings.limits.streams_per_client,
+        ),
         memory=memory,
         idle_timeout_s=settings.streams.idle_timeout_s,
         idle_notice_s=settings.streams.idle_notice_s,

@@ -42,6 +42,7 @@ class QueueLimits:
     checkpoint_s: float  # seconds of work that a crash may cost
     keep_s: float  # time that ended jobs are kept
     disk_bytes: int  # disk space
+    principal_bytes: int  # the same of one principal that has shown a credential
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -152,8 +153,8 @@ class JobQueue:
 
         Raises BadSequence, BadCalibration or FrameTooLarge if the upload cannot be stepped;
         UploadTooLarge, QueueFull or InsufficientStorage if it does not fit on the disk; QueueFull,
-        and Quota if the client has too many unfinished jobs; and NotReady or Draining if the server
-        accepts no work.
+        and Quota if the client has too many unfinished jobs or uses too much of the disk; and
+        NotReady or Draining if the server accepts no work.
         """
         options, upload = order.options, folder / "input"
         checking = checking_folder(upload, max_pixels=self._engine.max_pixels)
@@ -204,16 +205,25 @@ class JobQueue:
         self._check_room(client, owner)
         self._accepting.append((owner.name, client))
         try:
-            await self._check_disk(job)
+            await self._check_disk(job, owner)
             await self.jobs.add(folder, job)
         finally:
             self._accepting.remove((owner.name, client))
         return self.jobs.status(job.job_id)
 
-    async def _check_disk(self, job: Job) -> None:
+    async def _check_disk(self, job: Job, owner: Principal) -> None:
         try:
-            await self.jobs.check_room(job)
-        except (QueueFull, InsufficientStorage) as error:
+            await self.jobs.check_room(job)  # which also deletes what has expired
+            used = self.jobs.used_bytes(owner=owner.name)
+            if owner.proven and used + job.disk_bytes > self._limits.principal_bytes:
+                raise Quota(
+                    f"the sequences and results of {owner.name} use {used} bytes on disk, this one "
+                    f"needs {job.disk_bytes}, and the limit of one principal is "
+                    f"{self._limits.principal_bytes}; fetch and delete results, or try again later "
+                    "(the server's setting limits.sequences_mib)",
+                    retry_after_s=self.jobs.room_in_s(),
+                )
+        except (QueueFull, Quota, InsufficientStorage) as error:
             self._engine.metrics.sequences_refused.inc()
             log.warning("an upload of %s was refused: %s", job.client or "a client", error)
             raise

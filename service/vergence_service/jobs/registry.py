@@ -285,9 +285,10 @@ class JobRegistry:
         await self._background.run(self._store.delete, job_id)
         self._notify_changed()
 
-    def used_bytes(self) -> int:
-        """Return the disk space that all jobs use or have reserved."""
-        return sum(job.disk_bytes for job in self._jobs.values())
+    def used_bytes(self, *, owner: str | None = None) -> int:
+        """Return the disk space that all jobs, or those of an owner, use or have reserved."""
+        jobs = self._jobs.values()
+        return sum(job.disk_bytes for job in jobs if owner is None or job.owner == owner)
 
     async def expire(self) -> None:
         """Delete the jobs that ended too long ago, by the time that servers have run since.
@@ -341,11 +342,11 @@ class JobRegistry:
                 f"sequences and their results use {used} of {self._disk_bytes} bytes on disk, this "
                 f"one needs {needed}, and no result is deleted before it expires; fetch and delete "
                 "results, or try again later (the server's settings batch.disk_mib, batch.keep_h)",
-                retry_after_s=self._room_in_s(),
+                retry_after_s=self.room_in_s(),
             )
         await self.check_free(new.result_bytes, what="the result of the sequence")
 
-    def _room_in_s(self) -> float:
+    def room_in_s(self) -> float:
         """Estimate the time until a result expires, or a job ends that may fail."""
         up_s = self._store.uptime_s()
         waits_s = [

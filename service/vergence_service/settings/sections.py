@@ -191,11 +191,25 @@ class LimitSettings(Section):
     streams: PositiveInt = Field(
         default=4, description="most open streams of one principal; a token may allow others"
     )
+    state_mib: PositiveInt = Field(
+        default=256, description="memory of all streams of one principal, without steps"
+    )
+    megapixels_per_s: PositiveFloat = Field(
+        default=100.0,
+        description="a principal that has more stepped, left and right together, gets no further "
+        "stream",
+    )
+    requests: PositiveInt = Field(
+        default=64, description="most calls and requests of one principal that are open at once"
+    )
     iterations: PositiveInt = Field(
         default=8, description="most iterations of a step that one principal may ask for"
     )
     waiting_sequences: PositiveInt = Field(
         default=8, description="most unfinished sequences of one principal"
+    )
+    sequences_mib: PositiveInt = Field(
+        default=10_240, description="disk space of all sequences and results of one principal"
     )
     streams_per_client: PositiveInt | None = Field(
         default=None, description="most open streams of one address, over gRPC and HTTP"

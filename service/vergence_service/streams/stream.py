@@ -101,7 +101,7 @@ class Stream:
     owner: Principal = LOCAL
     transport: str = ""  # over which the client is attached
     # For administrators: when the last frames were stepped and how old they were then, in seconds.
-    answers: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=200))
+    answers: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=512))
     last_origin: Origin | None = None  # of the last step
     model_s: float = 0.0  # time in the model, of all frames
 

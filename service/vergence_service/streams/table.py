@@ -25,6 +25,7 @@ from vergence_service.access.principals import LOCAL, Principal
 from vergence_service.logs import log_event
 from vergence_service.memory import MemoryBudget, MemoryHold, StreamMemory
 from vergence_service.metrics import Metrics
+from vergence_service.streams.quotas import Quotas, User
 from vergence_service.streams.rectify import Rectifier
 from vergence_service.streams.stream import (
     Attachment,
@@ -55,14 +56,6 @@ class Place:
         return key_of(self.owner.name, self.stream_id)
 
 
-@dataclass(frozen=True, slots=True)
-class _User:
-    """Whose a connection or an opening is."""
-
-    owner: str
-    client: str
-
-
 class StreamTable:
     """All streams of one server, within its limits. ``clock`` returns seconds.
 
@@ -76,7 +69,6 @@ class StreamTable:
         self,
         *,
         capacity: int,
-        per_client: int | None,
         memory: MemoryBudget,
         idle_timeout_s: float,
         idle_notice_s: float,
@@ -85,13 +77,12 @@ class StreamTable:
         clock: Callable[[], float],
         metrics: Metrics,
         on_closed: Callable[[Stream], None],
-        per_principal: int | None = None,
+        quotas: Quotas,
     ) -> None:
         self.capacity = capacity
         self.idle_timeout_s = idle_timeout_s
         self.detach_grace_s = detach_grace_s
-        self._per_client = per_client
-        self._per_principal = per_principal
+        self._quotas = quotas
         self._memory = memory
         self._idle_notice_s = idle_notice_s
         self._silent_s = silent_s
@@ -100,11 +91,11 @@ class StreamTable:
         self._on_closed = on_closed
         # By their keys: owner and id.
         self._streams: dict[str, Stream] = {}
-        self._opening: dict[str, _User] = {}  # reserved places
+        self._opening: dict[str, User] = {}  # reserved places
         self._expired_s: dict[str, float] = {}  # tombstones
         # Connections that have lost their stream and must end, and the user of each. They count
         # towards the limits until they have ended.
-        self._leaving: dict[Attachment, _User] = {}
+        self._leaving: dict[Attachment, User] = {}
 
     def __len__(self) -> int:
         return len(self._streams)
@@ -138,7 +129,16 @@ class StreamTable:
                 "another id"
             )
         others = [*self._leaving.values(), *self._opening.values()]
-        self._check_quotas(owner, client, others)
+        streams = list(self._streams.values())
+        try:
+            self._quotas.check(
+                owner, client, need, streams=streams, others=others, now_s=self._clock()
+            )
+        except Quota as error:
+            if error.retry_after_s is None:
+                theirs = [each for each in streams if owner.name == each.owner.name]
+                error.retry_after_s = self._next_expiry_s(theirs)
+            raise
         if len(self._streams) + len(others) >= self.capacity:
             raise StreamLimit(
                 f"the server has {self.capacity} open streams, its limit; close one, or "
@@ -150,32 +150,13 @@ class StreamTable:
         except StateMemory as error:
             error.retry_after_s = self._next_expiry_s(self._streams.values())
             raise
-        self._opening[key] = _User(owner.name, client)
+        self._opening[key] = User(owner.name, client, need.own)
         try:
             yield place
         finally:
             del self._opening[key]
             if key not in self._streams:
                 place.memory.release()
-
-    def _check_quotas(self, owner: Principal, client: str, others: Iterable[_User]) -> None:
-        theirs = [each for each in self._streams.values() if each.owner.name == owner.name]
-        count = len(theirs) + sum(each.owner == owner.name for each in others)
-        most = owner.streams or self._per_principal
-        if owner.proven and most is not None and count >= most:
-            raise Quota(
-                f"{owner.name} has {count} open streams, the limit of one principal; close one, or "
-                "try again later (the server's setting limits.streams)",
-                retry_after_s=self._next_expiry_s(theirs),
-            )
-        here = [each for each in self._streams.values() if client and each.client == client]
-        count = len(here) + sum(bool(client) and each.client == client for each in others)
-        if self._per_client is not None and count >= self._per_client:
-            raise Quota(
-                f"{client} has {count} open streams, the limit per client; close one, or "
-                "try again later (the server's setting limits.streams_per_client)",
-                retry_after_s=self._next_expiry_s(here),
-            )
 
     def open(
         self,
@@ -229,7 +210,7 @@ class StreamTable:
                 f"stream {stream_id!r} was opened with another rig; open a new stream for this one"
             )
         if stream.attachment is not None:
-            self._leaving[stream.attachment] = _User(stream.owner.name, stream.client)
+            self._leaving[stream.attachment] = User(stream.owner.name, stream.client)
             stream.attachment.end(
                 Superseded(f"a newer connection attached to stream {stream_id!r}")
             )
@@ -299,7 +280,7 @@ class StreamTable:
             )
             stream.memory.release()
             if stream.attachment is not None:
-                self._leaving[stream.attachment] = _User(stream.owner.name, stream.client)
+                self._leaving[stream.attachment] = User(stream.owner.name, stream.client)
             self._count()
             self._on_closed(stream)
 

@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from contextlib import ExitStack, asynccontextmanager
 from typing import Any
 
 import grpc
@@ -49,23 +50,28 @@ class Identity(grpc.aio.ServerInterceptor):  # type: ignore[type-arg] # of its s
         self, behaviour: Callable[..., Any], authorization: str | None, administrative: bool
     ) -> Any:
         async def answer(request: Any, context: Context) -> Any:
-            async with errors_as_status(context):
-                self._admit(context, authorization, administrative)
-            return await behaviour(request, context)
+            async with self._admitted(context, authorization, administrative):
+                return await behaviour(request, context)
 
         async def answers(request: Any, context: Context) -> AsyncIterator[Any]:
-            async with errors_as_status(context):
-                self._admit(context, authorization, administrative)
-            async for each in behaviour(request, context):
-                yield each
+            async with self._admitted(context, authorization, administrative):
+                async for each in behaviour(request, context):
+                    yield each
 
         return answers if inspect.isasyncgenfunction(behaviour) else answer
 
-    def _admit(self, context: Context, authorization: str | None, administrative: bool) -> None:
-        caller = self._gate.caller(authorization, _certificate_names(context))
-        if administrative and not self._gate.open:
-            caller.check_admin()
-        CALLER.set(caller)
+    @asynccontextmanager
+    async def _admitted(
+        self, context: Context, authorization: str | None, administrative: bool
+    ) -> AsyncIterator[None]:
+        with ExitStack() as stack:
+            async with errors_as_status(context):
+                caller = self._gate.caller(authorization, _certificate_names(context))
+                if administrative and not self._gate.open:
+                    caller.check_admin()
+                stack.enter_context(self._gate.requests.of(caller))
+                CALLER.set(caller)
+            yield
 
 
 def _certificate_names(context: Context) -> Sequence[str]:

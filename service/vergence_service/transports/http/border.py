@@ -7,6 +7,7 @@ rebinding) can read answers too. So requests that name a foreign host or page ar
 
 import ipaddress
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 
@@ -89,18 +90,19 @@ class Border:
                     headers.setdefault(name, value)
             await send(message)
 
-        try:
-            if scope["path"] not in _OPEN_PATHS:
-                self._check(scope)
-        except DepthError as error:
-            answer: Response = refusal_of(error)
-            if self._logins is not None and _is_browser(scope):
-                answer = RedirectResponse(LOGIN, status_code=303)
-            await answer(scope, receive, send_with_headers)
-        else:
-            await self._app(scope, receive, send_with_headers)
+        with ExitStack() as stack:
+            try:
+                if scope["path"] not in _OPEN_PATHS:
+                    self._check(scope, stack)
+            except DepthError as error:
+                answer: Response = refusal_of(error)
+                if self._logins is not None and _is_browser(scope):
+                    answer = RedirectResponse(LOGIN, status_code=303)
+                await answer(scope, receive, send_with_headers)
+            else:
+                await self._app(scope, receive, send_with_headers)
 
-    def _check(self, scope: Scope) -> None:
+    def _check(self, scope: Scope, request: ExitStack) -> None:
         headers = Headers(scope=scope)
         self._hosts.check_host(headers.get("host", ""))
         self._hosts.check_page(headers)
@@ -111,7 +113,9 @@ class Border:
                 scope["caller"] = self._logins.caller(authorization, cookies)
             return
         names = scope.get("state", {}).get("certificate_names", ())
-        CALLER.set(self._gate.caller(authorization, names))
+        caller = self._gate.caller(authorization, names)
+        request.enter_context(self._gate.requests.of(caller))
+        CALLER.set(caller)
         if scope["method"] == "POST" and scope["path"].startswith(_PROTOBUF_PATHS):
             kind = headers.get("content-type", "").partition(";")[0].strip().lower()
             if kind != PROTOBUF_TYPE:

@@ -1,0 +1,121 @@
+"""What one principal may hold: memory, work, requests and disk. Another one is not affected."""
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import grpc
+import pytest
+
+from tests.support.frames import RIG, frame_message, make_frame, open_message
+from tests.support.http import ZIP, reason_of, submit
+from tests.support.models import RecallModel
+from tests.support.sequences import make_frames, sequence_files, zip_bytes
+from tests.support.server import RawCall, running_server
+from tests.support.status import reason_of as reason_over_grpc
+from tests.support.tokens import TokenFile, http_as, stub
+from vergence_proto.types import StereoRig
+from vergence_proto.v1 import depth_pb2 as pb
+from vergence_service.app.server import Running
+
+LARGE = StereoRig.from_rectified(replace(RIG, width=192, height=160))  # needs more than half a MiB
+
+
+@asynccontextmanager
+async def guarded(tmp_path: Path, **settings: Any) -> AsyncIterator[tuple[Running, TokenFile]]:
+    file = TokenFile(tmp_path / "tokens.toml", "ana", "ben")
+    async with running_server(
+        RecallModel(),
+        security__tokens=file.path,
+        batch__directory=tmp_path / "jobs",
+        **settings,
+    ) as server:
+        yield server, file
+
+
+async def opened(calls: Any, file: TokenFile, name: str, rig: StereoRig | None = None) -> RawCall:
+    call = RawCall(calls.StreamDepth(metadata=tuple(file.shown(name).items())))
+    await call.ask(open_message(rig=rig))
+    return call
+
+
+async def refusal(calls: Any, file: TokenFile, name: str, rig: StereoRig | None = None) -> str:
+    with pytest.raises(grpc.aio.AioRpcError) as failure:
+        await opened(calls, file, name, rig)
+    assert reason_over_grpc(failure.value) == "QUOTA"
+    return failure.value.details() or ""
+
+
+async def test_large_streams_of_one_principal_use_up_its_memory(tmp_path: Path) -> None:
+    async with guarded(tmp_path, limits__state_mib=1) as (server, file), stub(server) as calls:
+        first = await opened(calls, file, "ana", LARGE)
+        why = await refusal(calls, file, "ana", LARGE)
+        assert "192x160" in why
+        assert "limits.state_mib" in why
+        await opened(calls, file, "ana")  # a small one fits
+        await opened(calls, file, "ben", LARGE)
+        await end(first)
+        await opened(calls, file, "ana", LARGE)
+
+
+async def test_a_principal_whose_streams_take_much_gets_no_further_one(tmp_path: Path) -> None:
+    # A frame of 64x48 in five seconds is 0.0012 megapixels a second.
+    limit = 0.003
+    async with (
+        guarded(tmp_path, limits__megapixels_per_s=limit) as (server, file),
+        stub(server) as calls,
+    ):
+        busy = await opened(calls, file, "ana")
+        await busy.ask(frame_message(make_frame(1)))
+        await opened(calls, file, "ana")
+        for frame_id in (2, 3):
+            await busy.ask(frame_message(make_frame(frame_id)))
+        why = await refusal(calls, file, "ana")
+        assert "limits.megapixels_per_s" in why
+        assert "64x48" in why
+        await opened(calls, file, "ben")
+
+
+async def test_the_open_requests_of_one_principal_are_counted_on_all_ports(tmp_path: Path) -> None:
+    async with (
+        guarded(tmp_path, limits__requests=2) as (server, file),
+        stub(server) as calls,
+        http_as(server, file.shown("ana")) as ana,
+        http_as(server, file.shown("ben")) as ben,
+    ):
+        one, _ = [await opened(calls, file, "ana") for _ in range(2)]
+        assert "limits.requests" in await refusal(calls, file, "ana")
+        answer = await ana.get("/v1/sequences")
+        assert (answer.status_code, reason_of(answer)) == (429, "QUOTA")
+        assert (await ben.get("/v1/sequences")).status_code == 200
+        await end(one)
+        assert (await ana.get("/v1/sequences")).status_code == 200
+
+
+async def test_the_results_of_one_principal_leave_disk_to_others(tmp_path: Path) -> None:
+    archive = zip_bytes(sequence_files(make_frames(40)))
+    async with (
+        guarded(tmp_path, limits__sequences_mib=1) as (server, file),
+        http_as(server, file.shown("ana")) as ana,
+        http_as(server, file.shown("ben")) as ben,
+    ):
+        kept: list[str] = []
+        answer = await ana.post("/v1/sequences", content=archive, headers=ZIP)
+        while answer.status_code == 202 and len(kept) < 8:
+            kept.append(answer.json()["id"])
+            answer = await ana.post("/v1/sequences", content=archive, headers=ZIP)
+        assert kept
+        assert (answer.status_code, reason_of(answer)) == (429, "QUOTA")
+        assert "limits.sequences_mib" in answer.json()["detail"]
+        await submit(ben, archive)
+        for job_id in kept:
+            await ana.delete(f"/v1/sequences/{job_id}")
+        await submit(ana, archive)
+
+
+async def end(call: RawCall) -> None:
+    await call.send(pb.StreamDepthRequest(end=pb.End()))
+    while await call.receive() is not None:
+        pass
