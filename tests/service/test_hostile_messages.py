@@ -85,3 +85,19 @@ async def test_over_http_a_bomb_is_refused(path: str, body: bytes, status: int) 
         )
         assert answer.status_code == status
         assert "expected" in answer.json()["detail"]
+
+
+@pytest.mark.parametrize("algorithm", [grpc.Compression.Gzip, grpc.Compression.Deflate])
+async def test_grpcs_own_compression_is_refused(algorithm: grpc.Compression) -> None:
+    # Else 30 kB become a message of 32 MiB before the server has seen a byte of it.
+    async with (
+        running_server(RecallModel()) as server,
+        grpc.aio.insecure_channel(server.grpc_address, compression=algorithm) as channel,
+        raw_stream(server) as neighbour,
+    ):
+        with pytest.raises(grpc.aio.AioRpcError) as refusal:
+            await asked(channel, "unary_unary", f"{DEPTH}GetServerInfo", bytes(1 << 10))
+        assert refusal.value.code() is grpc.StatusCode.UNIMPLEMENTED
+        assert "compression" in (refusal.value.details() or "").lower()
+        answer = await neighbour.ask(frame_message(make_frame(1)))
+        assert answer.HasField("disparity")

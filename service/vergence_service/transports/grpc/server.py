@@ -42,6 +42,10 @@ _ROOM_OVER_THE_LIMIT = 1.25
 _CALLS_OF_A_CONNECTION = 64
 _MORE_CALLS = 64
 
+# Images and maps are compressed already. With gRPC's own compression 30 kB could become a message
+# of the largest size, before anything here has seen it.
+_ONLY_IDENTITY = 1
+
 # A client that vanished is noticed within 15 s instead of gRPC's two hours. Clients may ping every
 # 5 s. A connection without calls is closed after 10 to 20 s.
 _KEEPALIVE = (
@@ -175,6 +179,7 @@ class GrpcServer:
                 ("grpc.max_send_message_length", self._max_message_bytes),
                 ("grpc.max_allowed_incoming_connections", self._max_connections),
                 ("grpc.max_concurrent_streams", _CALLS_OF_A_CONNECTION),
+                ("grpc.compression_enabled_algorithms_bitset", _ONLY_IDENTITY),
                 ("grpc.server_handshake_timeout_ms", int(1000 * self._first_message_s)),
                 *_KEEPALIVE,
             ],
