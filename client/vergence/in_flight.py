@@ -1,10 +1,14 @@
 """The frames of a session that were sent and not answered, and the count of those dropped."""
 
 import asyncio
+from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 from vergence.results import DepthResult, Drops
+
+# Of a lossless session, so many answered frames are kept until the server has stored its state.
+_MOST_KEPT = 32
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -19,6 +23,8 @@ class FrameInFlight:
     """
     answer: asyncio.Future[DepthResult] | None
     """The result that ``step`` waits for; None for a live frame, whose result is iterated."""
+    reset_before: bool = False
+    """The session's memory was discarded before this frame."""
 
     def fail(self, error: Exception) -> None:
         """Raise ``error`` in the ``step`` that waits for this frame, if one does."""
@@ -33,6 +39,8 @@ class FramesInFlight:
         self.credit: int = 1
         self.drops: Drops = Drops()
         self._by_id: dict[int, FrameInFlight] = {}
+        # Answered frames that another server would need again.
+        self._kept: deque[FrameInFlight] = deque(maxlen=_MOST_KEPT)
         self._removed = asyncio.Event()
 
     @property
@@ -63,6 +71,23 @@ class FramesInFlight:
             if frame.answer is None:
                 self.count(lost=1)
             frame.fail(error)
+
+    def keep(self, frame: FrameInFlight) -> None:
+        """Keep an answered frame, to send it again to a server that has an earlier state."""
+        self._kept.append(frame)
+
+    def forget_kept(self, *, up_to: int | None = None) -> None:
+        """Forget the kept frames up to an id, or all of them."""
+        while self._kept and (up_to is None or self._kept[0].frame_id <= up_to):
+            self._kept.popleft()
+
+    def is_wanted(self, frame_id: int) -> bool:
+        """Return True if the frame has no answer yet, or is kept."""
+        return frame_id in self._by_id or any(frame.frame_id == frame_id for frame in self._kept)
+
+    def to_send_again(self) -> list[FrameInFlight]:
+        """Return the kept frames and those without an answer, in the order they were sent."""
+        return sorted([*self._kept, *self._by_id.values()], key=lambda frame: frame.frame_id)
 
     def __len__(self) -> int:
         """Return the number of frames without an answer."""

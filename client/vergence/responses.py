@@ -40,7 +40,9 @@ class ResponseRouter:
         clock: CaptureClock,
         *,
         paces: bool = False,
+        lossless: bool = False,
     ) -> None:
+        self._lossless = lossless
         self._clock = clock
         self._paces = paces  # the session paces its frames, so its credit is larger
         self.recent: RecentResults = RecentResults(clock.now_ns)
@@ -77,7 +79,7 @@ class ResponseRouter:
         encode = frame.request
 
         async def encoded() -> bytes | None:
-            if frame.frame_id not in self._in_flight:  # it was given up meanwhile
+            if not self._in_flight.is_wanted(frame.frame_id):  # it was given up meanwhile
                 return None
             try:
                 request = encode if isinstance(encode, bytes) else await self._in_thread(encode)
@@ -97,13 +99,22 @@ class ResponseRouter:
         paced = self._paces and opened.paced_credit
         self._in_flight.credit = max(paced or opened.credit, 1)
         taken = ConnectionLost("the connection broke after the server took the frame")
+        # A new stream needs no frame again whose answer is there.
+        kept_from = opened.last_frame_id if opened.resumed and opened.snapshots else None
+        self._in_flight.forget_kept(up_to=kept_from)
         frames = self._in_flight.in_order()
         self._in_flight.fail((f for f in frames if f.frame_id <= opened.last_frame_id), taken)
-        frames = self._in_flight.in_order()
-        requests = [self.request_of(frame) for frame in frames]
-        if self.reset_after is not None:
-            before = sum(frame.frame_id <= self.reset_after for frame in frames)
-            requests.insert(before, RESET)
+        requests: list[Request] = []
+        reset_after = self.reset_after
+        for frame in self._in_flight.to_send_again():
+            reset_is_next = reset_after is not None and frame.frame_id > reset_after
+            if frame.reset_before or reset_is_next:
+                requests.append(RESET)
+            if reset_is_next:
+                reset_after = None
+            requests.append(self.request_of(frame))
+        if reset_after is not None:
+            requests.append(RESET)
         return requests
 
     def detached(self, lost: ConnectionLost) -> None:
@@ -142,6 +153,7 @@ class ResponseRouter:
             self._failed(message.frame_id, error)
             return
         frame = self._in_flight.pop(message.frame_id)
+        self._keep_until_saved(frame, message)
         result = _depth_result(
             disparity_map, raw, age_s=age_s, drops=self._in_flight.drops, axes=self._axes
         )
@@ -154,6 +166,13 @@ class ResponseRouter:
             self._deliver(result)
         elif not frame.answer.done():  # done: the caller was cancelled
             frame.answer.set_result(result)
+
+    def _keep_until_saved(self, frame: FrameInFlight | None, message: pb.DisparityMap) -> None:
+        """Keep an answered frame of a lossless session until its server has stored the state."""
+        self._in_flight.forget_kept(up_to=message.saved_frame_id)
+        stores = self._lossless and self.opened is not None and self.opened.snapshots
+        if frame is not None and stores and frame.frame_id > message.saved_frame_id:
+            self._in_flight.keep(frame)
 
     async def _in_thread(self, work: Callable[[], Value]) -> Value:
         return await asyncio.get_running_loop().run_in_executor(self._threads, work)

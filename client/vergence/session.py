@@ -318,7 +318,8 @@ class DepthSession(SessionFacts):
         answer: asyncio.Future[DepthResult] | None,
     ) -> int:
         frame_id, self._next_id = self._next_id, self._next_id + 1
-        frame = FrameInFlight(frame_id, request, answer)
+        reset_before = self._parts.responses.reset_after == frame_id - 1
+        frame = FrameInFlight(frame_id, request, answer, reset_before)
         self._parts.in_flight.add(frame)
         self._parts.connection.send(self._parts.responses.request_of(frame))
         return frame_id

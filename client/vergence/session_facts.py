@@ -61,7 +61,12 @@ class SessionParts:
         in_flight = FramesInFlight()
         axes = codec.axes_from_proto(setup.opening.axes)
         responses = ResponseRouter(
-            in_flight, axes, setup.threads, setup.clock, paces=setup.link.adapts
+            in_flight,
+            axes,
+            setup.threads,
+            setup.clock,
+            paces=setup.link.adapts,
+            lossless=setup.delivery is Delivery.EVERY,
         )
         link = SessionLink(setup.link)
         connection = StreamConnection(

@@ -102,6 +102,17 @@ class Metrics:
         self.streams_closed = Counter(
             "vergence_streams_closed", "Streams that were closed or have expired", registry=registry
         )
+        self.snapshots = Counter(
+            "vergence_snapshots",
+            "Writes of stream snapshots, and other calls of their store that failed",
+            ["outcome"],
+            registry=registry,
+        )
+        for outcome in ("saved", "failed", "superseded"):
+            self.snapshots.labels(outcome)
+        self.snapshot_bytes = Counter(
+            "vergence_snapshot_bytes", "Bytes of the snapshots that were stored", registry=registry
+        )
         self.calls_open = Gauge(
             "vergence_calls_open", "StreamDepth calls that have not ended", registry=registry
         )

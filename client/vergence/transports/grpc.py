@@ -104,7 +104,7 @@ class GrpcTransport:
         )
         try:
             response: Answer = await invoke(
-                request, timeout=_ASK_TIMEOUT_S, metadata=self._metadata
+                request, timeout=_ASK_TIMEOUT_S, metadata=(*_stream_of(request), *self._metadata)
             )
         except grpc.aio.AioRpcError as error:
             raise _error_from_rpc(error, self._address, self._through) from None
@@ -115,6 +115,12 @@ class GrpcTransport:
         await self._channel.close(grace=None)
         for call in list(self._calls):
             await call.close()
+
+
+def _stream_of(request: Message) -> tuple[tuple[str, str], ...]:
+    """Return the metadata that leads a question about a stream to the server of the stream."""
+    stream_id = getattr(request, "stream_id", "")
+    return ((STREAM_ID_METADATA, stream_id),) if stream_id else ()
 
 
 def _tls_of(credentials: Credentials) -> grpc.ChannelCredentials:

@@ -70,9 +70,11 @@ class HttpTransport:
     async def ask(self, method: str, request: Message, answer: type[Answer]) -> Answer:
         self._check_open()
         content = request.SerializeToString()
+        stream_id = getattr(request, "stream_id", "")  # leads to the server of the stream
+        headers = {**_HEADERS, STREAM_ID_METADATA: stream_id} if stream_id else _HEADERS
         try:
             response = await self._http.post(
-                f"/v1/methods/{method}", content=content, headers=_HEADERS
+                f"/v1/methods/{method}", content=content, headers=headers
             )
         except httpx.TransportError as error:
             raise _lost(self._http, error) from None

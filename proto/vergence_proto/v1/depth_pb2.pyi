@@ -168,7 +168,7 @@ class OpenStream(_message.Message):
     def __init__(self, stream_id: _Optional[str] = ..., resume_token: _Optional[bytes] = ..., rig: _Optional[_Union[StereoRig, _Mapping[str, _Any]]] = ..., axes: _Optional[_Union[Axes, str]] = ..., delivery: _Optional[_Union[Delivery, str]] = ..., output: _Optional[_Union[OutputFormat, _Mapping[str, _Any]]] = ..., iterations: _Optional[int] = ..., cold_iterations: _Optional[int] = ..., weights_sha256: _Optional[str] = ..., opening_id: _Optional[bytes] = ..., paces: bool = ...) -> None: ...
 
 class StreamOpened(_message.Message):
-    __slots__ = ("stream_id", "resume_token", "credit", "rig", "model", "resumed", "detach_grace_s", "idle_timeout_s", "last_frame_id", "silent_s", "max_frame_scale", "paced_credit", "left_from_rectified")
+    __slots__ = ("stream_id", "resume_token", "credit", "rig", "model", "resumed", "detach_grace_s", "idle_timeout_s", "last_frame_id", "silent_s", "max_frame_scale", "paced_credit", "left_from_rectified", "snapshots")
     STREAM_ID_FIELD_NUMBER: _ClassVar[int]
     RESUME_TOKEN_FIELD_NUMBER: _ClassVar[int]
     CREDIT_FIELD_NUMBER: _ClassVar[int]
@@ -182,6 +182,7 @@ class StreamOpened(_message.Message):
     MAX_FRAME_SCALE_FIELD_NUMBER: _ClassVar[int]
     PACED_CREDIT_FIELD_NUMBER: _ClassVar[int]
     LEFT_FROM_RECTIFIED_FIELD_NUMBER: _ClassVar[int]
+    SNAPSHOTS_FIELD_NUMBER: _ClassVar[int]
     stream_id: str
     resume_token: bytes
     credit: int
@@ -195,7 +196,8 @@ class StreamOpened(_message.Message):
     max_frame_scale: int
     paced_credit: int
     left_from_rectified: Pose
-    def __init__(self, stream_id: _Optional[str] = ..., resume_token: _Optional[bytes] = ..., credit: _Optional[int] = ..., rig: _Optional[_Union[RectifiedRig, _Mapping[str, _Any]]] = ..., model: _Optional[_Union[ModelInfo, _Mapping[str, _Any]]] = ..., resumed: bool = ..., detach_grace_s: _Optional[float] = ..., idle_timeout_s: _Optional[float] = ..., last_frame_id: _Optional[int] = ..., silent_s: _Optional[float] = ..., max_frame_scale: _Optional[int] = ..., paced_credit: _Optional[int] = ..., left_from_rectified: _Optional[_Union[Pose, _Mapping[str, _Any]]] = ...) -> None: ...
+    snapshots: bool
+    def __init__(self, stream_id: _Optional[str] = ..., resume_token: _Optional[bytes] = ..., credit: _Optional[int] = ..., rig: _Optional[_Union[RectifiedRig, _Mapping[str, _Any]]] = ..., model: _Optional[_Union[ModelInfo, _Mapping[str, _Any]]] = ..., resumed: bool = ..., detach_grace_s: _Optional[float] = ..., idle_timeout_s: _Optional[float] = ..., last_frame_id: _Optional[int] = ..., silent_s: _Optional[float] = ..., max_frame_scale: _Optional[int] = ..., paced_credit: _Optional[int] = ..., left_from_rectified: _Optional[_Union[Pose, _Mapping[str, _Any]]] = ..., snapshots: bool = ...) -> None: ...
 
 class Frame(_message.Message):
     __slots__ = ("frame_id", "capture_ns", "left", "right", "pose", "max_age_s", "scale", "map_step")
@@ -272,7 +274,7 @@ class FramesDropped(_message.Message):
     def __init__(self, frame_ids: _Optional[_Iterable[int]] = ...) -> None: ...
 
 class DisparityMap(_message.Message):
-    __slots__ = ("frame_id", "capture_ns", "disparity", "confidence", "sigma", "world_from_left", "origin", "step_count", "iterations", "frames_skipped", "timings", "max_disparity_px", "map_step", "received_ns")
+    __slots__ = ("frame_id", "capture_ns", "disparity", "confidence", "sigma", "world_from_left", "origin", "step_count", "iterations", "frames_skipped", "timings", "max_disparity_px", "map_step", "received_ns", "saved_frame_id")
     FRAME_ID_FIELD_NUMBER: _ClassVar[int]
     CAPTURE_NS_FIELD_NUMBER: _ClassVar[int]
     DISPARITY_FIELD_NUMBER: _ClassVar[int]
@@ -287,6 +289,7 @@ class DisparityMap(_message.Message):
     MAX_DISPARITY_PX_FIELD_NUMBER: _ClassVar[int]
     MAP_STEP_FIELD_NUMBER: _ClassVar[int]
     RECEIVED_NS_FIELD_NUMBER: _ClassVar[int]
+    SAVED_FRAME_ID_FIELD_NUMBER: _ClassVar[int]
     frame_id: int
     capture_ns: int
     disparity: Plane
@@ -301,7 +304,8 @@ class DisparityMap(_message.Message):
     max_disparity_px: float
     map_step: int
     received_ns: int
-    def __init__(self, frame_id: _Optional[int] = ..., capture_ns: _Optional[int] = ..., disparity: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., confidence: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., sigma: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., world_from_left: _Optional[_Union[Pose, _Mapping[str, _Any]]] = ..., origin: _Optional[_Union[Origin, str]] = ..., step_count: _Optional[int] = ..., iterations: _Optional[int] = ..., frames_skipped: _Optional[int] = ..., timings: _Optional[_Union[Timings, _Mapping[str, _Any]]] = ..., max_disparity_px: _Optional[float] = ..., map_step: _Optional[int] = ..., received_ns: _Optional[int] = ...) -> None: ...
+    saved_frame_id: int
+    def __init__(self, frame_id: _Optional[int] = ..., capture_ns: _Optional[int] = ..., disparity: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., confidence: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., sigma: _Optional[_Union[Plane, _Mapping[str, _Any]]] = ..., world_from_left: _Optional[_Union[Pose, _Mapping[str, _Any]]] = ..., origin: _Optional[_Union[Origin, str]] = ..., step_count: _Optional[int] = ..., iterations: _Optional[int] = ..., frames_skipped: _Optional[int] = ..., timings: _Optional[_Union[Timings, _Mapping[str, _Any]]] = ..., max_disparity_px: _Optional[float] = ..., map_step: _Optional[int] = ..., received_ns: _Optional[int] = ..., saved_frame_id: _Optional[int] = ...) -> None: ...
 
 class Timings(_message.Message):
     __slots__ = ("decode_us", "queue_us", "model_us", "encode_us", "total_us")

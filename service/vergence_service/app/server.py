@@ -3,7 +3,7 @@
 import asyncio
 import time
 from collections.abc import AsyncIterator, Callable, Coroutine
-from contextlib import asynccontextmanager, closing
+from contextlib import asynccontextmanager, closing, nullcontext
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
@@ -21,6 +21,7 @@ from vergence_service.app.security import (
     make_certificate,
     make_gate,
 )
+from vergence_service.app.snapshots import make_snapshots
 from vergence_service.app.zenoh import ZenohTransport, serving_zenoh
 from vergence_service.descriptors import affordable_connections
 from vergence_service.inference.batcher import StepBatcher
@@ -91,7 +92,7 @@ async def running(
     """Run a server; it serves until the end of the block.
 
     Raises SettingsError if strangers could reach it or its tokens or certificate cannot be read,
-    PortTaken if a port is in use, ExtraMissing if Zenoh is not installed, ZenohUnreachable
+    PortTaken if a port is in use, ExtraMissing if Zenoh or Redis is not installed, ZenohUnreachable
     if its network cannot be joined, and ManifestError or ProviderUnavailable if the model cannot
     be loaded.
     """
@@ -125,6 +126,8 @@ async def running(
     def closed(stream: Stream) -> None:
         batcher.forget(stream.key)
         turns.forget(stream.key)
+        if stream.saver is not None:
+            stream.saver.close()
 
     streams = StreamTable(
         capacity=settings.streams.capacity,
@@ -144,6 +147,7 @@ async def running(
         on_closed=closed,
     )
     threads = Threads(lanes=model.max_concurrent_steps)
+    snapshots = make_snapshots(settings, threads, metrics=metrics)
     engine = DepthEngine(
         streams,
         batcher,
@@ -163,6 +167,7 @@ async def running(
         metrics=metrics,
         threads=threads,
         turns=turns,
+        snapshots=snapshots,
     )
     max_frame_bytes = settings.limits.max_frame_mib * _MIB
     limits = StreamLimits(
@@ -191,6 +196,7 @@ async def running(
     # The outermost context ends last: no transport outlives the batcher that it uses.
     async with (
         threads,
+        snapshots or nullcontext(),
         batcher,
         GrpcServer(
             DepthServicer(unary, open_calls("grpc")),

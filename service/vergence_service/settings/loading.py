@@ -26,6 +26,7 @@ from vergence_service.settings.sections import (
     Section,
     SecuritySettings,
     ServerSettings,
+    SnapshotSettings,
     StreamSettings,
     ZenohSettings,
 )
@@ -89,6 +90,7 @@ class Settings(BaseSettings):
     streams: StreamSettings = StreamSettings()
     limits: LimitSettings = LimitSettings()
     continuity: ContinuitySettings = ContinuitySettings()
+    snapshots: SnapshotSettings = SnapshotSettings()
     batch: BatchSettings = BatchSettings()
 
     def to_toml(self) -> str:

@@ -230,6 +230,18 @@ class ContinuitySettings(Section):
     )
 
 
+class SnapshotSettings(Section):
+    store: str = Field(
+        default="none",
+        pattern=r"^(none|rediss?://\S+|unix://\S+)$",
+        description="where the states of streams are kept for other servers: none, or "
+        "redis://HOST:PORT/DATABASE (needs the extra fleet)",
+    )
+    timeout_s: PositiveFloat = Field(
+        default=1.0, description="abandon a call of the store after this long; no frame waits"
+    )
+
+
 class BatchSettings(Section):
     directory: Path | None = Field(
         default=None,

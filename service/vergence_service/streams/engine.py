@@ -8,7 +8,6 @@ from enum import Enum
 from vergence_proto.errors import (
     DepthError,
     Draining,
-    ModelChanged,
     NonFinite,
     NotReady,
     UnknownStream,
@@ -27,10 +26,13 @@ from vergence_service.inference.batcher import StepBatcher
 from vergence_service.inference.model import RecurrentState, Step, StereoModel
 from vergence_service.memory import MemoryBudget, StreamMemory
 from vergence_service.metrics import Metrics
+from vergence_service.snapshots.saver import Snapshots
 from vergence_service.streams.continuity import ContinuityLimits
 from vergence_service.streams.conversion import SteppedFrame, decoded_view
+from vergence_service.streams.iterations import IterationCounts, check_weights
 from vergence_service.streams.needs import ImageSizes, stream_memory
 from vergence_service.streams.rectify import Rectifier, check_rig
+from vergence_service.streams.resuming import StreamResumer
 from vergence_service.streams.search_window import SearchReach
 from vergence_service.streams.stream import Attachment, Notice, NoticeKind, Stream, StreamConfig
 from vergence_service.streams.table import StreamTable
@@ -72,6 +74,7 @@ class DepthEngine:
         metrics: Metrics,
         threads: Threads,
         turns: Turns | None = None,
+        snapshots: Snapshots | None = None,
     ) -> None:
         self.streams = streams
         self.turns = Turns(places=2, lanes=1, clock=clock) if turns is None else turns
@@ -83,13 +86,19 @@ class DepthEngine:
         self._batcher = batcher
         self._model = model
         self._sizes = sizes
-        self._iterations = iterations
-        self._cold_iterations = cold_iterations
+        self._iterations = IterationCounts(self.card, iterations, cold_iterations)
         self.continuity = limits  # beyond which a frame starts cold
         self._reach = SearchReach(self.card.max_disparity_px, min_range_share)
         self._clock = clock
         self._phase = _Phase.LOADING
         self._started = asyncio.Event()
+        self.resumer = StreamResumer(
+            streams,
+            snapshots,
+            weights_sha256=self.card.weights_sha256,
+            memory_of=self._check_opening,
+            rectifier_of=self._rectifier,
+        )
 
     @property
     def ready(self) -> bool:
@@ -125,8 +134,7 @@ class DepthEngine:
         await self._load(Delivery.EVERY)
 
     async def _load(self, delivery: Delivery) -> None:
-        counts = (self._iterations, self._cold_iterations[delivery])
-        await self._batcher.warm_up(*map(self.card.iterations_at_most, counts))
+        await self._batcher.warm_up(*self._iterations.loaded_for(delivery))
 
     def drain(self, *, within_s: float) -> None:
         """Accept no new streams, and notify the clients that are attached."""
@@ -153,10 +161,10 @@ class DepthEngine:
         FrameTooLarge if the configuration cannot be served, BadShape if the id is not allowed,
         StreamExists if it is in use, and Quota, StreamLimit or StateMemory if a limit is reached.
         """
-        self._check_model(config)
+        check_weights(config, self.card)
         made = self.streams.made_by(stream_id, config.opening_id, owner=owner.name)
         if made is not None and attachment is not None:  # the client did not get the answer
-            return self.resume(
+            return await self.resume(
                 stream_id,
                 made.resume_token,
                 config,
@@ -167,9 +175,11 @@ class DepthEngine:
         need = await self._check_opening(config)
         with self.streams.reserve(stream_id, need, client=client, owner=owner) as place:
             rectifier = await self._rectifier(config.rig)
-            return self.streams.open(place, config, rectifier, attachment=attachment)
+            stream = self.streams.open(place, config, rectifier, attachment=attachment)
+        self.resumer.keep(stream)
+        return stream
 
-    def resume(
+    async def resume(
         self,
         stream_id: str,
         resume_token: bytes,
@@ -179,7 +189,7 @@ class DepthEngine:
         client: str = "",
         owner: Principal = LOCAL,
     ) -> Stream:
-        """Attach a new connection to an open stream.
+        """Attach a new connection to an open stream, here or of another server's snapshot.
 
         Raises NotReady or Draining if no streams are accepted, ModelChanged if the server runs
         other weights, UnknownStream or StreamExpired if the stream is gone, StreamExists if the
@@ -188,8 +198,8 @@ class DepthEngine:
         self._check_serving()
         # Check the model before the stream. A server that restarted does not know the stream any
         # more, but the client must learn that a new stream would run on another network.
-        self._check_model(config)
-        return self.streams.attach(
+        check_weights(config, self.card)
+        return await self.resumer.resume(
             stream_id, resume_token, config, attachment=attachment, client=client, owner=owner
         )
 
@@ -286,6 +296,10 @@ class DepthEngine:
         stream.frames_skipped += 1
         self.metrics.frames_failed.labels(error.code).inc()
 
+    def note_sent(self, stepped: SteppedFrame) -> None:
+        """Keep the state after a frame, now that the client has its answer, not before."""
+        self.resumer.save_after(stepped)
+
     async def close(self, stream_id: str, *, owner: str = LOCAL.name) -> None:
         """End a stream and free its state; any connection of its owner may ask for it.
 
@@ -307,14 +321,6 @@ class DepthEngine:
             case _Phase.DRAINING:
                 raise Draining("the server is shutting down; try another one")
 
-    def _check_model(self, config: StreamConfig) -> None:
-        if config.weights_sha256 not in ("", self.card.weights_sha256):
-            raise ModelChanged(
-                f"expected a server with weights {config.weights_sha256[:12]}, this one runs "
-                f"{self.card.name} with {self.card.weights_sha256[:12]}; open a new stream to "
-                "continue with these"
-            )
-
     async def _check_opening(self, config: StreamConfig) -> StreamMemory:
         with suppress(TimeoutError):
             async with asyncio.timeout(_LOADING_PATIENCE_S):
@@ -325,8 +331,8 @@ class DepthEngine:
             config.rig,
             self._model,
             self._reach,
-            warm_iterations=self._iterations_of(config, cold=False),
-            cold_iterations=self._iterations_of(config, cold=True),
+            warm_iterations=self._iterations.of(config, cold=False),
+            cold_iterations=self._iterations.of(config, cold=True),
         )
 
     async def _rectifier(self, rig: StereoRig) -> Rectifier:
@@ -355,7 +361,7 @@ class DepthEngine:
                 decode_s = self._clock() - started_s
                 stream.check_order(frame.frame_id)
                 state, origin = stream.state_before(view, self.continuity)
-                iterations = self._iterations_of(stream.config, cold=state is None)
+                iterations = self._iterations.of(stream.config, cold=state is None)
                 live = stream.config.delivery is Delivery.NEWEST
                 result, timings = await self._batcher.step(
                     Step(view, state, iterations),
@@ -383,11 +389,4 @@ class DepthEngine:
     def _forget(self, stream: Stream, reason: Origin) -> None:
         """Discard the stream's state. A model without memory has none, so it has no reason."""
         stream.forget(reason if self.card.recurrent else Origin.COLD_START)
-
-    def _iterations_of(self, config: StreamConfig, *, cold: bool) -> int:
-        wanted = (
-            config.cold_iterations or self._cold_iterations[config.delivery]
-            if cold
-            else config.iterations or self._iterations
-        )
-        return self.card.iterations_at_most(wanted)
+        self.resumer.save(stream)

@@ -12,6 +12,7 @@ from vergence_proto.types import Delivery, Origin, OutputFormat, StereoRig
 from vergence_service.access.principals import LOCAL, Principal
 from vergence_service.inference.model import RecurrentState, StereoView
 from vergence_service.memory import MemoryHold
+from vergence_service.snapshots.saver import StreamSaver
 from vergence_service.streams.continuity import ContinuityLimits, break_between
 from vergence_service.streams.rectify import Rectifier
 
@@ -104,6 +105,7 @@ class Stream:
     answers: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=512))
     last_origin: Origin | None = None  # of the last step
     model_s: float = 0.0  # time in the model, of all frames
+    saver: StreamSaver | None = None  # None: no snapshots are kept
 
     @property
     def key(self) -> str:

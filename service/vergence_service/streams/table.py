@@ -165,13 +165,17 @@ class StreamTable:
         rectifier: Rectifier,
         *,
         attachment: Attachment | None,
+        resume_token: bytes = b"",
     ) -> Stream:
-        """Open a stream at a place that :meth:`reserve` has reserved."""
+        """Open a stream at a place that :meth:`reserve` has reserved.
+
+        ``resume_token``: the one of a stream that another server had. Empty: the stream is new.
+        """
         self._expired_s.pop(place.key, None)
         stream = Stream(
             place.stream_id,
             place.client,
-            secrets.token_bytes(16),
+            resume_token or secrets.token_bytes(16),
             config,
             rectifier,
             place.memory,
@@ -181,9 +185,10 @@ class StreamTable:
         )
         self._streams[place.key] = stream
         self._metrics.streams_opened.inc()
-        self._metrics.openings.labels("opened").inc()
+        self._metrics.openings.labels("resumed" if resume_token else "opened").inc()
         size = f"{config.rig.left.width}x{config.rig.left.height}"
-        log_event(log, "stream opened", **_about(stream), size=size)
+        what = "stream resumed from its snapshot" if resume_token else "stream opened"
+        log_event(log, what, **_about(stream), size=size)
         self._count()
         return stream
 
@@ -251,6 +256,11 @@ class StreamTable:
                 f"or without a frame for {self.idle_timeout_s:g} s; open it again"
             )
         raise UnknownStream(f"no open stream {stream_id!r}; open it before sending frames")
+
+    def find(self, key: str) -> Stream | None:
+        """Return the open stream of a key, if there is one."""
+        self.sweep()
+        return self._streams.get(key)
 
     def made_by(
         self, stream_id: str, opening_id: bytes, *, owner: str = LOCAL.name

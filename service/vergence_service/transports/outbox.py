@@ -52,8 +52,10 @@ class Outbox:
         metrics: Metrics,
         threads: ThreadPool,
         on_encoded: Callable[[str, Principal, float], None],
+        on_sent: Callable[[SteppedFrame], None],
     ) -> None:
         self._write = write
+        self._on_sent = on_sent
         self._threads = threads
         self._on_encoded = on_encoded
         self._clock = clock
@@ -111,6 +113,7 @@ class Outbox:
                     self._on_encoded(stepped.stream.key, stepped.stream.owner, cost.seconds)
                     await self._write(response)
                     self._unsent.release()
+                    self._on_sent(stepped)
                 case _Ping(client_ns, arrived_s):
                     hold_ns = int((self._clock() - arrived_s) * 1e9)
                     pong = pb.Pong(
@@ -137,6 +140,7 @@ class Outbox:
             output = replace(output, map_step=map_step)
         message = codec.disparity_to_proto(stepped.disparity_map(), output, into=response.disparity)
         message.received_ns = int(stepped.arrived_s * 1e9)
+        message.saved_frame_id = stepped.stream.saver.saved_frame_id if stepped.stream.saver else 0
         now_s = self._clock()
         timings = replace(
             stepped.timings, encode_s=now_s - started_s, total_s=now_s - stepped.arrived_s

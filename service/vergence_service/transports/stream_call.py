@@ -8,17 +8,24 @@ from dataclasses import dataclass
 from functools import partial
 
 from vergence_proto import codec
-from vergence_proto.errors import DepthError, Quota, StreamExists, StreamExpired, UnknownStream
+from vergence_proto.errors import (
+    DepthError,
+    Draining,
+    StreamExists,
+    StreamExpired,
+    UnknownStream,
+)
 from vergence_proto.types import Delivery
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.access.principals import Principal
 from vergence_service.logs import log_event
 from vergence_service.streams.conversion import SteppedFrame
 from vergence_service.streams.engine import DepthEngine
-from vergence_service.streams.stream import Notice, Stream, StreamConfig
+from vergence_service.streams.stream import Notice, Stream
 from vergence_service.threads import Cost
 from vergence_service.transports.displaced import DisplacedFrames
 from vergence_service.transports.mailbox import Mailbox, QueuedFrame
+from vergence_service.transports.opening import stream_config
 from vergence_service.transports.outbox import Outbox
 from vergence_service.transports.unary import model_info
 
@@ -81,6 +88,7 @@ class DepthCall:
             metrics=engine.metrics,
             threads=engine.threads.live,
             on_encoded=engine.turns.charge,
+            on_sent=engine.note_sent,
         )
         self._displaced = DisplacedFrames(self._outbox, on_reported=self._answered)
         self._reader: asyncio.Task[None] | None = None
@@ -163,6 +171,8 @@ class DepthCall:
             self._engine.streams.detach(stream, self)
             self._detached.set()
         if self._error is not None:
+            if isinstance(self._error, Draining):  # another server has the stream next
+                await self._engine.resumer.flush(stream)
             raise self._error
         if self._client_is_done:
             await self._engine.close(stream.stream_id, owner=stream.owner.name)
@@ -209,24 +219,9 @@ class DepthCall:
             self._paces = request.paces and request.delivery != pb.DELIVERY_EVERY
         else:
             raise UnknownStream("the first message of a call must open or resume a stream")
-        config = StreamConfig(
-            rig=codec.rig_from_proto(request.rig),
-            axes=codec.axes_from_proto(request.axes),
-            delivery=codec.delivery_from_proto(request.delivery),
-            output=codec.output_format_from_proto(request.output),
-            iterations=request.iterations,
-            cold_iterations=request.cold_iterations,
-            weights_sha256=request.weights_sha256,
-            opening_id=request.opening_id,
-        )
-        asked = max(config.iterations, config.cold_iterations)
-        if self._caller.proven and asked > self._limits.iterations:
-            raise Quota(
-                f"expected at most {self._limits.iterations} iterations of one principal, got "
-                f"{asked}; ask for fewer (the server's setting limits.iterations)"
-            )
+        config = stream_config(request, self._caller, most_iterations=self._limits.iterations)
         if request.resume_token:
-            resumed = self._engine.resume(
+            resumed = await self._engine.resume(
                 request.stream_id,
                 request.resume_token,
                 config,
@@ -255,6 +250,7 @@ class DepthCall:
             detach_grace_s=self._engine.streams.detach_grace_s,
             idle_timeout_s=self._engine.streams.idle_timeout_s,
             last_frame_id=stream.last_frame_id,
+            snapshots=stream.saver is not None,
             silent_s=self._limits.silent_s,
             max_frame_scale=codec.MAX_FRAME_SCALE,
             paced_credit=self._limits.paced_credit if self._paces else 0,
