@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import redis
 
@@ -28,7 +29,7 @@ class RedisServer:
         self.port = _free_port()
         self.address = f"127.0.0.1:{self.port}"
         self.url = f"redis://{self.address}/0"
-        self.admin = redis.Redis(port=self.port, decode_responses=False)
+        self.admin: Any = redis.Redis(port=self.port)  # its types are those of every protocol
         self.start()
 
     def start(self) -> None:
