@@ -171,7 +171,7 @@ def load_model_card(weights_dir: Path, name: str) -> ModelCard:
         manifest = json.loads(path.read_bytes())
     except FileNotFoundError:
         raise ManifestError(f"no manifest at {path}; export a model there first") from None
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise ManifestError(f"{path} is not JSON: {error}") from None
     if manifest.get("format") != MANIFEST_FORMAT:
         raise ManifestError(

@@ -1,5 +1,6 @@
 """Calibration files: a rig written as each tool writes it reads back as the same rig."""
 
+import itertools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -327,6 +328,13 @@ def test_opencv_of_a_rectified_pair_has_projections_alone(tmp_path: Path) -> Non
     assert rectified.baseline_m == pytest.approx(0.1)
 
 
+# Ten references to the line above in each line: 10 ** 8 values in 300 bytes.
+NESTED = "".join(
+    f"{name}: &{name} [{', '.join(10 * [f'*{above}'])}]\n"
+    for above, name in itertools.pairwise("abcdefghi")
+)
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -342,6 +350,13 @@ def test_opencv_of_a_rectified_pair_has_projections_alone(tmp_path: Path) -> Non
         ('{"value0": {"intrinsics": []}}', "expected a list of at least 2"),
         ('{"format": "vergence-rig", "version": 99}', "newer version"),
         ('{"format": "vergence-rig", "version": 1}', "expected 'left'"),
+        ("a: &a [1]\n" + NESTED + "cam0: *i\n", "got more than 262144 values"),
+        ("a: &a {k: 1}\ncam0: {<<: *a}\n", "got a merge key <<"),
+        ("cam0: &a [*a]\n", "got more than 262144 values"),
+        ('<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]><opencv_storage/>', "document type"),
+        ("cam0: " + 5000 * "9", "neither YAML nor JSON"),
+        ("cam0: 2026-99-99", "neither YAML nor JSON"),
+        (5000 * "[", "neither YAML nor JSON"),
     ],
 )
 def test_a_bad_file_is_named_with_what_is_wrong(tmp_path: Path, text: str, expected: str) -> None:

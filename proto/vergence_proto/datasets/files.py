@@ -68,7 +68,7 @@ def read_object(path: Path, purpose: str) -> JsonObject:
     text = read_text(path, purpose)
     try:
         read = json.loads(_TRAILING_COMMA.sub(r"\1", text))
-    except (json.JSONDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise DatasetError(f"{path}: not JSON: {error}") from None
     if not isinstance(read, dict):
         raise DatasetError(f"{path}: expected a JSON object, got {type(read).__name__}")
