@@ -58,6 +58,7 @@ async def serving_http(
     engine: DepthEngine,
     unary: UnaryMethods,
     calls: OpenCalls,
+    places: Places,
     *,
     connections: int,
     gate: Gate,
@@ -91,8 +92,6 @@ async def serving_http(
         min_bytes_per_s=min_bytes_per_s,
         archive=replace(archive, max_files=2),
     )
-    places = Places(settings.limits.pairs)
-    engine.metrics.pairs.set_function(lambda: len(places))
     stopping = asyncio.Event()
     async with AsyncExitStack() as stack:
         # First of all: a server that cannot listen must not take a folder of jobs.

@@ -28,6 +28,7 @@ from vergence_service.inference.batcher import StepBatcher
 from vergence_service.inference.engines import ServedModel, load_model
 from vergence_service.inference.model import StereoModel
 from vergence_service.inference.onnx_model import packaged_weights_dir
+from vergence_service.jobs.places import Places
 from vergence_service.jobs.queue import JobQueue
 from vergence_service.memory import MemoryBudget, affordable_bytes
 from vergence_service.metrics import Metrics
@@ -42,6 +43,7 @@ from vergence_service.streams.table import StreamTable
 from vergence_service.streams.turns import Turns
 from vergence_service.threads import Threads
 from vergence_service.transports.addresses import format_address
+from vergence_service.transports.grpc.inference_protocol import InferenceServicer
 from vergence_service.transports.grpc.server import DepthServicer, GrpcServer
 from vergence_service.transports.http.app import HttpServer
 from vergence_service.transports.open_calls import OpenCalls
@@ -186,6 +188,8 @@ async def running(
         max_frame_bytes=max_frame_bytes,
     )
 
+    places = Places(settings.limits.pairs)
+    metrics.pairs.set_function(lambda: len(places))
     connections = affordable_connections(settings.limits.connections)
 
     def open_calls(transport: str) -> OpenCalls:
@@ -200,6 +204,7 @@ async def running(
         batcher,
         GrpcServer(
             DepthServicer(unary, open_calls("grpc")),
+            InferenceServicer(engine, places, max_frame_bytes=max_frame_bytes),
             host=grpc_host,
             port=settings.grpc.port,
             max_frame_bytes=max_frame_bytes,
@@ -214,6 +219,7 @@ async def running(
             engine,
             unary,
             open_calls("http"),
+            places,
             connections=connections,
             gate=gate,
             certificate=certificate,

@@ -1,4 +1,4 @@
-"""vergence.v1.DepthService over grpc.aio, with the standard health and reflection services."""
+"""The services over grpc.aio: depth and pairs, with the standard health and reflection."""
 
 import asyncio
 import logging
@@ -9,11 +9,14 @@ from typing import Any, Self
 from urllib.parse import unquote
 
 import grpc
+from google.protobuf.descriptor import FileDescriptor
+from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message import Message
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
-from grpc_reflection.v1alpha import reflection
+from grpc_reflection.v1alpha import reflection, reflection_pb2
 
 from vergence_proto.codec import Request, read_request, read_small
+from vergence_proto.open_inference import inference_pb2
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.access.gate import Gate
 from vergence_service.access.principals import Principal
@@ -24,6 +27,8 @@ from vergence_service.transports.grpc.deadlines import FirstMessageDeadline
 from vergence_service.transports.grpc.errors import Context, errors_as_status
 from vergence_service.transports.grpc.hang_up import hang_up
 from vergence_service.transports.grpc.identity import Identity
+from vergence_service.transports.grpc.inference_protocol import SERVICE as INFERENCE_SERVICE
+from vergence_service.transports.grpc.inference_protocol import InferenceServicer
 from vergence_service.transports.grpc.small_requests import SmallRequests
 from vergence_service.transports.open_calls import FINISHING_SHARE, OpenCalls
 from vergence_service.transports.stream_call import ClientLost
@@ -77,6 +82,20 @@ async def _write(context: Context, response: pb.StreamDepthResponse) -> None:
 
 
 _Answer = tuple[type[Message], Callable[[Any, Principal], Awaitable[Message]]]
+
+
+def _described() -> DescriptorPool:
+    """Return the descriptions of all services; those of the inference protocol lie apart."""
+    pool = DescriptorPool()
+
+    def add(file: FileDescriptor) -> None:
+        for each in file.dependencies:
+            add(each)
+        pool.AddSerializedFile(file.serialized_pb)
+
+    for service in (pb, inference_pb2, health_pb2, reflection_pb2):
+        add(service.DESCRIPTOR)
+    return pool
 
 
 def _host_of(peer: str) -> str:
@@ -145,6 +164,7 @@ class GrpcServer:
     def __init__(
         self,
         servicer: DepthServicer,
+        inference: InferenceServicer,
         *,
         host: str,
         port: int,
@@ -157,6 +177,7 @@ class GrpcServer:
         self._gate = gate
         self._certificate = certificate
         self._servicer = servicer
+        self._inference = inference
         self._host = host
         self._max_connections = max_connections
         self._first_message_s = first_message_s
@@ -185,11 +206,16 @@ class GrpcServer:
             ],
         )
         self._server.add_generic_rpc_handlers(
-            [grpc.method_handlers_generic_handler(_SERVICE, self._servicer.handlers)]
+            [
+                grpc.method_handlers_generic_handler(_SERVICE, self._servicer.handlers),
+                grpc.method_handlers_generic_handler(INFERENCE_SERVICE, self._inference.handlers),
+            ]
         )
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
         reflection.enable_server_reflection(
-            [_SERVICE, health.SERVICE_NAME, reflection.SERVICE_NAME], self._server
+            [_SERVICE, INFERENCE_SERVICE, health.SERVICE_NAME, reflection.SERVICE_NAME],
+            self._server,
+            _described(),
         )
         await self._set_health(health_pb2.HealthCheckResponse.NOT_SERVING)
         # gRPC's own error does not say why, and it writes a second one to stderr.

@@ -1,15 +1,12 @@
 """Single pairs by the Open Inference Protocol v2, as inference servers speak it over HTTP.
 
-Its clients and its tools for measuring work as they are. A pair is two tensors, ``left`` and
-``right``, uint8 [1, H, W, 3]; the answer is ``disparity`` and ``sigma``, float32 [1, H, W]. Streams
-and everything that they remember stay with the protocol of this project.
+Its clients and its tools for measuring work as they are.
 """
 
 import json
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import version as installed_version
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,27 +17,17 @@ from fastapi.responses import JSONResponse
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from vergence_proto.errors import BadShape, DepthError, FrameTooLarge, UploadTooLarge
-from vergence_proto.geometry import RectifiedRig
-from vergence_proto.types import (
-    Delivery,
-    DisparityMap,
-    Image,
-    OutputFormat,
-    StereoFrame,
-    StereoRig,
-)
+from vergence_proto.errors import BadShape, DepthError, UploadTooLarge
+from vergence_proto.types import Image
 from vergence_service.jobs.places import Places
 from vergence_service.streams.engine import DepthEngine
-from vergence_service.streams.stream import StreamConfig
+from vergence_service.transports import open_inference
 from vergence_service.transports.http.errors import HTTP_STATUS
 from vergence_service.transports.http.uploads import UploadLimits, body_chunks, while_connected
+from vergence_service.transports.open_inference import MODEL_VERSION, Maps
 
 JSON_LENGTH = "Inference-Header-Content-Length"  # bytes of JSON before the binary tensors
-_INPUTS = ("left", "right")
-_OUTPUTS = ("disparity", "sigma")
 _LARGEST_JSON = 8 << 20  # its numbers take a dozen times the memory
-_VERSION = "1"
 
 
 class _Parameters(BaseModel):
@@ -86,13 +73,15 @@ def inference_routes(engine: DepthEngine, places: Places, *, limits: UploadLimit
     """Make the routes below /v2. Pairs share the ``places`` of /v1/pairs."""
     # The protocol has a schema of its own, and errors of its own.
     router = APIRouter(include_in_schema=False)
-    name = engine.card.name
-    model_paths = ("/v2/models/{model}", f"/v2/models/{{model}}/versions/{_VERSION}")
+    model_paths = ("/v2/models/{model}", f"/v2/models/{{model}}/versions/{MODEL_VERSION}")
 
     @router.get("/v2")
     async def server() -> dict[str, Any]:
-        version = installed_version("vergence")
-        return {"name": "vergence", "version": version, "extensions": ["binary_tensor_data"]}
+        return {
+            "name": open_inference.SERVER,
+            "version": open_inference.server_version(),
+            "extensions": ["binary_tensor_data"],
+        }
 
     @router.get("/v2/health/live")
     async def live() -> Response:
@@ -103,16 +92,18 @@ def inference_routes(engine: DepthEngine, places: Places, *, limits: UploadLimit
         return Response(status_code=200 if engine.ready else 503)
 
     async def model_ready(model: Annotated[str, PathParameter()]) -> Response:
-        if model != name:
-            return _unknown(model, name)
+        if (missing := open_inference.no_such_model(model, "", engine)) is not None:
+            return _unknown(missing)
         return Response(status_code=200 if engine.ready else 503)
 
     async def model_metadata(model: Annotated[str, PathParameter()]) -> Response:
-        return JSONResponse(_metadata(engine)) if model == name else _unknown(model, name)
+        if (missing := open_inference.no_such_model(model, "", engine)) is not None:
+            return _unknown(missing)
+        return JSONResponse(_metadata(engine))
 
     async def infer(model: Annotated[str, PathParameter()], request: Request) -> Response:
-        if model != name:
-            return _unknown(model, name)
+        if (missing := open_inference.no_such_model(model, "", engine)) is not None:
+            return _unknown(missing)
         try:
             places.check()  # before the upload, which would be for nothing
             with tempfile.TemporaryDirectory() as scratch:
@@ -136,32 +127,22 @@ def inference_routes(engine: DepthEngine, places: Places, *, limits: UploadLimit
 async def _inferred(engine: DepthEngine, body: Path, json_length: str | None) -> Response:
     background = engine.threads.background
     pair = await background.run(_pair_of, body, json_length, engine.max_pixels)
-    height, width = pair.left.shape[:2]
-    rig = RectifiedRig(
-        width=width,
-        height=height,
-        fx=float(width),  # any focal length gives the same disparity
-        fy=float(width),
-        cx_left=(width - 1) / 2,
-        cx_right=(width - 1) / 2,
-        cy=(height - 1) / 2,
-        baseline_m=1.0,
-    )
-    config = StreamConfig(
-        StereoRig.from_rectified(rig), delivery=Delivery.EVERY, output=OutputFormat(sigma=True)
-    )
-    frame = StereoFrame(1, 0, pair.left, pair.right)
-    async with engine.offline(config) as stream:
-        disparity, _ = await engine.step_offline(stream, lambda: frame)
-    return await background.run(_answer, engine.card.name, pair.request, disparity)
+    maps = await open_inference.step_pair(engine, pair.left, pair.right)
+    return await background.run(_answer, engine.card.name, pair.request, maps)
 
 
 def _metadata(engine: DepthEngine) -> dict[str, Any]:
-    inputs = [{"name": each, "datatype": "UINT8", "shape": [1, -1, -1, 3]} for each in _INPUTS]
-    outputs = [{"name": each, "datatype": "FP32", "shape": [1, -1, -1]} for each in _OUTPUTS]
+    inputs = [
+        {"name": each, "datatype": open_inference.INPUT_TYPE, "shape": open_inference.INPUT_SHAPE}
+        for each in open_inference.INPUTS
+    ]
+    outputs = [
+        {"name": each, "datatype": open_inference.OUTPUT_TYPE, "shape": open_inference.OUTPUT_SHAPE}
+        for each in open_inference.OUTPUTS
+    ]
     return {
         "name": engine.card.name,
-        "versions": [_VERSION],
+        "versions": [MODEL_VERSION],
         "platform": engine.computed_by,
         "inputs": inputs,
         "outputs": outputs,
@@ -188,26 +169,17 @@ def _pair_of(body: Path, json_length: str | None, max_pixels: int) -> _Pair:
                 f"{'.'.join(map(str, each['loc']))}: {each['msg']}" for each in error.errors()[:3]
             )
             raise BadShape(problems) from None
-        if sorted(each.name for each in request.inputs) != ["left", "right"]:
-            raise BadShape("expected one input left and one input right")
+        open_inference.check_inputs([each.name for each in request.inputs])
         images = {each.name: _image_of(each, file, max_pixels) for each in request.inputs}
         if file.read(1):
             raise BadShape("the body holds more bytes than its tensors")
     left, right = images["left"], images["right"]
-    if left.shape != right.shape:
-        raise BadShape(f"expected two images of one shape, got {left.shape} and {right.shape}")
+    open_inference.check_pair(left, right)
     return _Pair(request, left, right)
 
 
 def _image_of(given: _Input, file: Any, max_pixels: int) -> Image:
-    batch, height, width, channels = given.shape
-    if batch != 1 or channels != 3 or height < 1 or width < 1:
-        raise BadShape(f"{given.name}: expected a shape of [1, H, W, 3], got {given.shape}")
-    if height * width > max_pixels:
-        raise FrameTooLarge(
-            f"{given.name}: expected at most {max_pixels} pixels, got {width}x{height}"
-        )
-    count = height * width * channels
+    count = open_inference.check_shape(given.name, given.shape, max_pixels=max_pixels)
     size = given.parameters.binary_data_size
     if size is not None:
         if size != count:
@@ -215,29 +187,21 @@ def _image_of(given: _Input, file: Any, max_pixels: int) -> Image:
         values = np.frombuffer(file.read(count), np.uint8)
     else:
         values = _bytes_of(given)
-    if values.size != count:
-        raise BadShape(f"{given.name}: expected {count} values for its shape, got {values.size}")
-    return values.reshape(height, width, channels)
+    return open_inference.image_of(given.name, given.shape, values)
 
 
 def _bytes_of(given: _Input) -> NDArray[np.uint8]:
     """The values in JSON: flat, or in lists of lists."""
     try:
         numbers = np.asarray(given.data if given.data is not None else [])
-        if numbers.dtype.kind not in "iu" or numbers.min() < 0 or numbers.max() > 255:
-            raise ValueError
-    except ValueError:
-        raise BadShape(f"{given.name}: expected whole numbers from 0 to 255 in data") from None
-    return numbers.astype(np.uint8).ravel()
+    except ValueError:  # lists of different lengths
+        numbers = np.empty(0)
+    if numbers.dtype.kind not in "iu":
+        raise BadShape(f"{given.name}: expected whole numbers from 0 to 255 in its values")
+    return open_inference.bytes_of(given.name, numbers)
 
 
-def _answer(model: str, request: _InferRequest, disparity: DisparityMap) -> Response:
-    assert disparity.sigma_px is not None
-    # JSON has no NaN: 0 is no value, as in the files of KITTI.
-    maps: Mapping[str, NDArray[np.float32]] = {
-        "disparity": np.nan_to_num(disparity.disparity_px, nan=0.0),
-        "sigma": disparity.sigma_px,
-    }
+def _answer(model: str, request: _InferRequest, maps: Maps) -> Response:
     all_binary = request.parameters.binary_data_output
     wanted: Sequence[tuple[str, bool]] = [
         (each.name, each.parameters.binary_data) for each in request.outputs
@@ -245,7 +209,7 @@ def _answer(model: str, request: _InferRequest, disparity: DisparityMap) -> Resp
     described: list[dict[str, Any]] = []
     tensors: list[bytes] = []
     for name, binary in wanted:
-        values = np.ascontiguousarray(maps[name], np.float32)
+        values = maps[name]
         about: dict[str, Any] = {"name": name, "datatype": "FP32", "shape": [1, *values.shape]}
         if binary:
             tensors.append(values.astype("<f4").tobytes())
@@ -253,7 +217,11 @@ def _answer(model: str, request: _InferRequest, disparity: DisparityMap) -> Resp
         else:
             about["data"] = values.ravel().tolist()
         described.append(about)
-    answer: dict[str, Any] = {"model_name": model, "model_version": _VERSION, "outputs": described}
+    answer: dict[str, Any] = {
+        "model_name": model,
+        "model_version": MODEL_VERSION,
+        "outputs": described,
+    }
     if request.id:
         answer["id"] = request.id
     head = json.dumps(answer).encode()
@@ -264,8 +232,8 @@ def _answer(model: str, request: _InferRequest, disparity: DisparityMap) -> Resp
     return Response(body, media_type="application/octet-stream", headers=headers)
 
 
-def _unknown(model: str, own: str) -> Response:
-    return JSONResponse({"error": f"there is no model {model[:100]!r}, only {own}"}, 404)
+def _unknown(missing: str) -> Response:
+    return JSONResponse({"error": missing}, 404)
 
 
 def _error(error: DepthError) -> Response:
