@@ -23,6 +23,17 @@ class JobState(StrEnum):
         return self in (JobState.DONE, JobState.FAILED, JobState.CANCELLED)
 
 
+class JobPriority(StrEnum):
+    """Which of the waiting jobs is next; a running one is not stopped."""
+
+    LOW = "low"
+    """After all others."""
+    NORMAL = "normal"
+    """Oldest first."""
+    HIGH = "high"
+    """Before all others."""
+
+
 class Output(StrEnum):
     """One kind of map that a result holds for every frame."""
 

@@ -177,12 +177,20 @@ async def test_a_transfer_that_is_cut_again_and_again_sends_only_the_cut_parts_t
             up, cuts = proxy.up, proxy.cuts
             frames = [frame async for frame in job.frames()]
             kept = job.info.frames
+            down, cuts_down = proxy.down, proxy.cuts
+            archive = await job.download(tmp_path / "cut.zip", "npz")
+            down, cuts_down = proxy.down - down, proxy.cuts - cuts_down
         async with AsyncBatchClient(server.http_address) as client:
-            whole = [each async for each in (await client.job(job.id)).frames()]
+            direct = await client.job(job.id)
+            whole = [each async for each in direct.frames()]
+            expected_archive = await direct.download(tmp_path / "whole.zip", "npz")
     assert kept == len(frames) == 12
     assert cuts >= 3
     # Headers, and what was on its way when a line was cut.
     assert up < size + 12_000 * (cuts + 3)
+    assert cuts_down >= 3
+    assert archive.read_bytes() == expected_archive.read_bytes()
+    assert down < archive.stat().st_size + 6_000 * (cuts_down + 1)
     for frame, expected in zip(frames, whole, strict=True):
         assert frame.disparity_px is not None
         np.testing.assert_array_equal(frame.disparity_px, expected.disparity_px)

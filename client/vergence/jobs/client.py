@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 from vergence.errors import NotOpen
+from vergence.jobs.fetching import fetch, fetch_bytes
 from vergence.jobs.frames import BatchFrame
 from vergence.jobs.info import JobInfo
 from vergence.jobs.packing import Upload, upload_of
@@ -320,21 +321,15 @@ class AsyncBatchJob:
         target.parent.mkdir(parents=True, exist_ok=True)
         await self.wait()
 
-        async def fetch() -> None:
-            answers = self._requests.stream(
-                f"{self._path}/result", query={"format": format}, headers={}
-            )
-            async for answer in answers:
-                if answer.is_error:
-                    await answer.aread()
-                    problem = answer.json()
-                    raise error_from_wire(problem["reason"], problem["detail"])
-                with await asyncio.to_thread(target.open, "wb") as file:
-                    async for chunk in answer.aiter_bytes():
-                        self._requests.moved()
-                        await asyncio.to_thread(file.write, chunk)
+        with await asyncio.to_thread(target.open, "wb") as file:
 
-        await self._requests.patiently(fetch)
+            async def write(offset: int, chunk: bytes) -> None:
+                if offset == 0:  # the first piece, or the server makes another archive
+                    await asyncio.to_thread(file.seek, 0)
+                    await asyncio.to_thread(file.truncate)
+                await asyncio.to_thread(file.write, chunk)
+
+            await fetch(self._requests, f"{self._path}/result", write, query={"format": format})
         return target
 
     async def _raw_frames(self, after: int) -> AsyncGenerator[JobFrame, None]:
@@ -371,11 +366,10 @@ class AsyncBatchJob:
     async def _frame(self, index: int) -> JobFrame:
         while True:
             try:
-                answer = await self._requests.ask("GET", f"{self._path}/frames/{index}")
+                data = await fetch_bytes(self._requests, f"{self._path}/frames/{index}")
                 break
             except SequenceNotDone:  # a server that restarted steps it again
                 await asyncio.sleep(_WATCH_EVERY_S)
-        data = answer.content
         if self._rig is None and decode_record(data).error is None:
             rig = (await self.manifest())["rig"]
             self._rig = None if rig is None else RectifiedRig(**rig)

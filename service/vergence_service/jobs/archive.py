@@ -14,7 +14,8 @@ import numpy as np
 
 from vergence_proto.film import CannotFilm, FilmWriter
 from vergence_proto.job_results.folders import RESULT_LAYOUTS
-from vergence_proto.job_results.frame_file import STEPS_PER_PX
+from vergence_proto.job_results.folders.base import Layout
+from vergence_proto.job_results.frame_file import STEPS_PER_PX, JobFrame
 from vergence_proto.job_results.manifest import VERSION, about_of
 from vergence_proto.jobs import ResultFormat
 from vergence_proto.types import Plane
@@ -88,41 +89,61 @@ def manifest_of(status: JobStatus, folder: Path) -> dict[str, Any]:
     }
 
 
+def layout_of(status: JobStatus, folder: Path, form: ResultFormat) -> Layout:
+    """Return the layout of a result. Raises BadShape: the job has not kept what it needs."""
+    return RESULT_LAYOUTS[form](about_of(manifest_of(status, folder)))
+
+
 def zip_of(status: JobStatus, folder: Path, form: ResultFormat) -> Iterator[bytes]:
-    """Make a zip in a layout, and yield it in pieces.
+    """Make a zip in a layout, and yield the files of each frame, then the rest.
 
     Raises BadShape before the first piece: the job has not kept what the layout needs.
     """
-    layout = RESULT_LAYOUTS[form](about_of(manifest_of(status, folder)))
-    return _zipping(layout.frame, layout.end, folder)
+    return _zipping(layout_of(status, folder, form), folder)
 
 
-def _zipping(frame_files: Any, last_files: Any, folder: Path) -> Iterator[bytes]:
+def _zipping(layout: Layout, folder: Path) -> Iterator[bytes]:
     sink = _Sink()
     with zipfile.ZipFile(sink, "w") as archive:
         for frame in read_frames(folder):
-            for file in frame_files(frame):
+            for file in layout.frame(frame):
                 archive.writestr(zipfile.ZipInfo(file.name), file.content)
             yield sink.take()
-        for file in last_files():
+        for file in layout.end():
             archive.writestr(zipfile.ZipInfo(file.name), file.content)
     yield sink.take()
 
 
-def mp4_of(job: Job, folder: Path) -> Iterator[bytes]:
-    """Make a film of disparity, and yield it in pieces, which are empty while frames are encoded.
+def zipped_frame(layout: Layout, frame: JobFrame) -> bytes:
+    """Return the files of a frame as they are in any zip: without the directory at its end."""
+    sink = _Sink()
+    with zipfile.ZipFile(sink, "w") as archive:
+        for file in layout.frame(frame):
+            archive.writestr(zipfile.ZipInfo(file.name), file.content)
+        return sink.take()
 
-    Raises CannotEncode before the first piece.
+
+def write_film(job: Job, folder: Path, path: Path) -> Iterator[None]:
+    """Make a film of disparity at ``path``, and yield after each frame.
+
+    Raises CannotEncode before the first frame.
     """
-    with tempfile.TemporaryDirectory() as scratch:
-        path = Path(scratch) / "disparity.mp4"
+    path.parent.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
+        unfinished = Path(scratch) / "disparity.mp4"
         maps = (frame.disparity for frame in read_frames(folder))
         planes = (each.offset_px for each in maps if each is not None)
-        for _ in _writing_mp4(path, planes, job.source_fps or _FILM_FPS):
-            yield b""
-        with path.open("rb") as file:
-            while chunk := file.read(_CHUNK):
-                yield chunk
+        yield from _writing_mp4(unfinished, planes, job.source_fps or _FILM_FPS)
+        unfinished.replace(path)
+
+
+def read_pieces(path: Path, start: int, stop: int) -> Iterator[bytes]:
+    """Yield the bytes of a file from ``start`` to before ``stop``."""
+    with path.open("rb") as file:
+        file.seek(start)
+        while start < stop and (chunk := file.read(min(_CHUNK, stop - start))):
+            start += len(chunk)
+            yield chunk
 
 
 def _time(unix_s: float | None) -> str | None:

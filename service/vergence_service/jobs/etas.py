@@ -16,9 +16,11 @@ class Place:
 
 
 def places_of(unfinished: Sequence[Job], running: Mapping[str, JobProgress]) -> dict[str, Place]:
-    """Return the place of each unfinished job, oldest first, by its id."""
+    """Return the place of each unfinished job by its id; ``unfinished`` are in their order."""
     places, work = {}, 0.0
-    for ahead, job in enumerate(unfinished):
+    # A running job is not stopped for one of a higher priority.
+    order = sorted(unfinished, key=lambda job: job.job_id not in running)
+    for ahead, job in enumerate(order):
         runs = job.job_id in running
         places[job.job_id] = Place(0 if runs else ahead, work)
         if not runs:

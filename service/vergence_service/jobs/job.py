@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from vergence_proto.jobs import JobOutput, JobState, OnError, Quality, WarningKind
+from vergence_proto.jobs import JobOutput, JobPriority, JobState, OnError, Quality, WarningKind
+
+RANKS = {JobPriority.HIGH: 0, JobPriority.NORMAL: 1, JobPriority.LOW: 2}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,6 +43,8 @@ class Job:
     owner: str = ""  # principal that submitted it; empty: one of an older server
     name: str = ""  # the client's own name for it
     labels: Mapping[str, str] = field(default_factory=dict)  # the client's own
+    priority: JobPriority = JobPriority.NORMAL
+    keep_input: bool = False  # until the result expires, for another run
     key: str = ""  # the client's key of the submission, so that it is not accepted twice
     key_fingerprint: str = ""  # of the request with this key
     options: JobOptions = field(default_factory=JobOptions)
@@ -87,6 +91,7 @@ def job_from_json(document: str) -> Job:
             **values,
             "notes": tuple(values.get("notes", ())),
             "state": JobState(values["state"]),
+            "priority": JobPriority(values.get("priority", JobPriority.NORMAL)),
             "warnings": tuple(JobWarning(WarningKind(kind), text) for kind, text in warnings),
             "options": JobOptions(
                 **{

@@ -10,6 +10,8 @@ import json
 import secrets
 import shutil
 import time
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -66,12 +68,29 @@ class KeptUploads:
             f"no upload {upload_id[:64]!r}: it never existed, was deleted or submitted, or expired"
         )
 
+    def held_bytes(self, besides: str = "") -> int:
+        """Return the space of all uploads as announced, without the one of the id ``besides``."""
+        return sum(each.length for each in self._all() if each.upload_id != besides)
+
+    def missing_bytes(self) -> int:
+        """Return the space that uploads have announced and do not use yet."""
+        return sum(each.length - each.offset for each in self._all())
+
+    def _all(self) -> Iterator[KeptUpload]:
+        for folder in self._directory.iterdir() if self._directory.is_dir() else ():
+            with suppress(OSError, ValueError, KeyError):  # deleted meanwhile, or damaged
+                yield self._read(folder)
+
     def delete(self, upload_id: str) -> None:
         """Delete an upload that exists."""
         shutil.rmtree(self._directory / upload_id, ignore_errors=True)
 
-    def expire(self) -> None:
-        """Delete the uploads to which nothing was added for too long."""
+    def expire(self) -> float | None:
+        """Delete the uploads to which nothing was added for too long.
+
+        Returns the time in seconds until the next one expires, None if there is none.
+        """
+        waits_s: list[float] = []
         for folder in self._directory.iterdir() if self._directory.is_dir() else ():
             try:
                 if folder.name.startswith(_UNFINISHED):  # of a crash, if it stays so
@@ -80,8 +99,11 @@ class KeptUploads:
                     expires_s = self._read(folder).expires_s
             except (OSError, ValueError, KeyError):  # deleted meanwhile, or damaged
                 expires_s = 0.0
-            if expires_s <= time.time():
+            if (wait_s := expires_s - time.time()) > 0:
+                waits_s.append(wait_s)
+            else:
                 shutil.rmtree(folder, ignore_errors=True)
+        return min(waits_s, default=None)
 
     def _read(self, folder: Path) -> KeptUpload:
         body = (folder / _BODY).stat()

@@ -10,8 +10,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
 
-from vergence_proto.errors import BadSequence, BadShape, InsufficientStorage, QueueFull, Quota
-from vergence_proto.jobs import JobOutput, OnError, Quality
+from vergence_proto.errors import (
+    BadSequence,
+    BadShape,
+    InsufficientStorage,
+    QueueFull,
+    Quota,
+    SequenceNotDone,
+)
+from vergence_proto.jobs import JobOutput, JobPriority, OnError, Quality
 from vergence_service.access.principals import LOCAL, Principal
 from vergence_service.jobs.forecast import forecast
 from vergence_service.jobs.job import Job, JobOptions
@@ -20,8 +27,10 @@ from vergence_service.jobs.passes import BLOCK
 from vergence_service.jobs.progress import JobStatus
 from vergence_service.jobs.registry import JobRegistry
 from vergence_service.jobs.results import read_records, result_bytes
+from vergence_service.jobs.room import DiskRoom
 from vergence_service.jobs.run import job_stream_config
 from vergence_service.jobs.sources import check_readable, find_sequence, missing_images
+from vergence_service.jobs.storage import linking
 from vergence_service.jobs.store import JobStore, folder_bytes, remove_folder
 from vergence_service.jobs.tally import tally_of
 from vergence_service.jobs.upload_checks import checking_folder
@@ -51,6 +60,9 @@ class JobOrder:
 
     source: str | None = None  # KIND:PATH; needed if the upload contains several sequences
     options: JobOptions = field(default_factory=JobOptions)
+    upload: str = ""  # id of the upload that it came in, if that arrived in parts
+    priority: JobPriority = JobPriority.NORMAL
+    keep_input: bool = False  # for another run
     name: str = ""
     labels: Mapping[str, str] = field(default_factory=dict)
     key: str = ""  # so that a repeated submission is not accepted twice
@@ -69,14 +81,22 @@ class JobQueue:
         self.jobs = JobRegistry(
             store,
             keep_s=limits.keep_s,
-            disk_bytes=limits.disk_bytes,
             background=self.threads,
         )
         self.uploads = KeptUploads(store.directory / "uploads", keep_s=limits.keep_s)
+        self.room = DiskRoom(
+            store,
+            self.jobs,
+            self.uploads,
+            disk_bytes=limits.disk_bytes,
+            background=self.threads,
+        )
         self._engine = engine
         self._store = store
         self._limits = limits
-        self._worker = JobWorker(engine, self.jobs, checkpoint_s=limits.checkpoint_s)
+        self._worker = JobWorker(
+            engine, self.jobs, checkpoint_s=limits.checkpoint_s, uploads=self.uploads
+        )
         # Owner and client of the jobs that are being added.
         self._accepting: list[tuple[str, str]] = []
 
@@ -109,7 +129,7 @@ class JobQueue:
         a place in the queue only when it is complete: a slow one keeps nobody out.
         """
         self._check_room(client, owner)
-        await self.jobs.check_free(upload_bytes, what="the upload")
+        await self.room.check_free(upload_bytes, what="the upload")
         folder = await self.threads.run(self._store.new_folder)
         try:
             yield folder
@@ -192,6 +212,8 @@ class JobQueue:
             owner=owner.name,
             name=order.name,
             labels=order.labels,
+            priority=order.priority,
+            keep_input=order.keep_input,
             key=order.key,
             key_fingerprint=order.key_fingerprint,
             options=options,
@@ -205,15 +227,15 @@ class JobQueue:
         self._check_room(client, owner)
         self._accepting.append((owner.name, client))
         try:
-            await self._check_disk(job, owner)
+            await self._check_disk(job, owner, order.upload)
             await self.jobs.add(folder, job)
         finally:
             self._accepting.remove((owner.name, client))
         return self.jobs.status(job.job_id)
 
-    async def _check_disk(self, job: Job, owner: Principal) -> None:
+    async def _check_disk(self, job: Job, owner: Principal, upload: str) -> None:
         try:
-            await self.jobs.check_room(job)  # which also deletes what has expired
+            await self.room.check_job(job, upload=upload)  # which also deletes what has expired
             used = self.jobs.used_bytes(owner=owner.name)
             if owner.proven and used + job.disk_bytes > self._limits.principal_bytes:
                 raise Quota(
@@ -248,6 +270,21 @@ class JobQueue:
         """Stop a job if it has not ended, and delete all its files. Raises UnknownSequence."""
         self.jobs.hide(job_id)
         await to_the_end(self._delete(job_id))
+
+    async def link_input(self, job_id: str, folder: Path) -> None:
+        """Make ``folder``/input from the input that a job has kept.
+
+        Raises UnknownSequence, and SequenceNotDone if it has kept none.
+        """
+        kept = self.jobs.folder(job_id) / "input"
+        job = self.jobs.get(job_id)
+        if not await self.threads.run(kept.is_dir):
+            raise SequenceNotDone(
+                f"sequence {job_id} has not kept its input; submit sequences that are to run again "
+                "with keep_input=true"
+            )
+        with self.jobs.reading(job.job_id):
+            await self.threads.finish(linking(kept, folder / "input"))
 
     async def _delete(self, job_id: str) -> None:
         await self._worker.cancel(job_id)

@@ -1,4 +1,4 @@
-"""All jobs of a server in memory: their state, progress and results, within age and disk limits."""
+"""All jobs of a server in memory: their state, progress and results, until they expire."""
 
 import asyncio
 import time
@@ -9,19 +9,17 @@ from dataclasses import replace
 from pathlib import Path
 
 from vergence_proto.errors import (
-    QueueFull,
     SequenceNotDone,
     UnknownSequence,
-    UploadTooLarge,
 )
 from vergence_proto.jobs import JobState
 from vergence_service.access.principals import Principal
 from vergence_service.jobs.etas import Place, eta_s, places_of
 from vergence_service.jobs.index import JobIndex
-from vergence_service.jobs.job import Job
+from vergence_service.jobs.job import RANKS, Job
 from vergence_service.jobs.progress import JobProgress, JobStatus
 from vergence_service.jobs.results import has_frames
-from vergence_service.jobs.storage import check_free, disk_trouble, flushing
+from vergence_service.jobs.storage import disk_trouble, flushing
 from vergence_service.jobs.store import JobStore, folder_bytes
 from vergence_service.threads import ThreadPool, to_the_end
 
@@ -38,13 +36,10 @@ class JobRegistry:
     loop; threads touch the files and the database.
     """
 
-    def __init__(
-        self, store: JobStore, *, keep_s: float, disk_bytes: int, background: ThreadPool
-    ) -> None:
+    def __init__(self, store: JobStore, *, keep_s: float, background: ThreadPool) -> None:
         self._store = store
         self._background = background
         self._keep_s = keep_s
-        self._disk_bytes = disk_bytes
         self._jobs: dict[str, Job] = {}
         self._index = JobIndex()
         self._running: dict[str, JobProgress] = {}
@@ -82,8 +77,9 @@ class JobRegistry:
             raise self._unknown(job_id)
 
     def unfinished(self) -> list[Job]:
-        """Return the jobs that wait or run, oldest first."""
-        return [job for job in self._jobs.values() if not job.ended]
+        """Return the jobs that wait or run: by priority, and then oldest first."""
+        unfinished = [job for job in self._jobs.values() if not job.ended]
+        return sorted(unfinished, key=lambda job: RANKS[job.priority])
 
     def count(self, state: JobState) -> int:
         """Count the jobs in a state."""
@@ -259,11 +255,14 @@ class JobRegistry:
         if await self._background.run(result.exists):
             await self._background.finish(flushing(result))
             used = await self._background.run(folder_bytes, result)
+        kept = 0
+        if job.keep_input:
+            kept = await self._background.run(folder_bytes, result.parent / "input")
         job = replace(
             job,
             finished_s=time.time(),
             finished_up_s=self._store.uptime_s(),
-            disk_bytes=used,
+            disk_bytes=used + kept,
             result_bytes=used,
         )
         await self._background.run(self._store.update, job)
@@ -311,40 +310,6 @@ class JobRegistry:
     def _frames_done(self, job: Job) -> int:
         progress = self._running.get(job.job_id)
         return job.reached if progress is None else progress.frames_done
-
-    async def check_free(self, needed_bytes: int, *, what: str) -> None:
-        """Raise InsufficientStorage unless the disk has room for ``needed_bytes`` more."""
-        await self._background.run(
-            check_free,
-            self._store.directory,
-            needed_bytes,
-            promised_bytes=self.promised_bytes(),
-            what=what,
-        )
-
-    async def check_room(self, new: Job) -> None:
-        """Refuse a job that does not fit beside all results that have not expired.
-
-        Its upload is on the disk already. Raises UploadTooLarge if the job can never fit, QueueFull
-        if it does not fit now, and InsufficientStorage if the disk has no room for its result.
-        """
-        needed = new.disk_bytes
-        if needed > self._disk_bytes:
-            raise UploadTooLarge(
-                f"the sequence and its result need {needed} bytes, the server keeps "
-                f"{self._disk_bytes} for all sequences; send it in parts, or start the server with "
-                "a larger batch.disk_mib"
-            )
-        await self.expire()
-        used = self.used_bytes()
-        if used + needed > self._disk_bytes:
-            raise QueueFull(
-                f"sequences and their results use {used} of {self._disk_bytes} bytes on disk, this "
-                f"one needs {needed}, and no result is deleted before it expires; fetch and delete "
-                "results, or try again later (the server's settings batch.disk_mib, batch.keep_h)",
-                retry_after_s=self.room_in_s(),
-            )
-        await self.check_free(new.result_bytes, what="the result of the sequence")
 
     def room_in_s(self) -> float:
         """Estimate the time until a result expires, or a job ends that may fail."""

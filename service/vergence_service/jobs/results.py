@@ -149,8 +149,8 @@ def read_frame(folder: Path, index: int, rig: RectifiedRig | None) -> JobFrame:
     return decode_frame(frame_path(folder, index).read_bytes(), rig)
 
 
-def read_frames(folder: Path) -> Iterator[JobFrame]:
-    """Read every frame that is done, in order, those without a map included.
+def read_frames(folder: Path, first: int = 0) -> Iterator[JobFrame]:
+    """Read every frame that is done from ``first`` on, in order, those without a map included.
 
     Raises BadImage: a file is damaged.
     """
@@ -158,7 +158,7 @@ def read_frames(folder: Path) -> Iterator[JobFrame]:
         rig = read_made(folder).rig
     except FileNotFoundError:
         return
-    for path in sorted(folder.glob(f"*{SUFFIX}")):
+    for path in sorted(folder.glob(f"*{SUFFIX}"))[first:]:
         try:
             yield decode_frame(path.read_bytes(), rig)
         except BadImage as error:

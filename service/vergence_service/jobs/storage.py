@@ -75,6 +75,19 @@ def flushing(folder: Path) -> Iterator[None]:
         yield
 
 
+def linking(source: Path, target: Path) -> Iterator[None]:
+    """Give all files of a folder a second name below ``target``, and yield after each."""
+    for parent, _, names in os.walk(source):
+        there = target / Path(parent).relative_to(source)
+        there.mkdir(parents=True)
+        for name in names:
+            try:
+                os.link(Path(parent) / name, there / name)
+            except OSError:  # a file system without links
+                shutil.copyfile(Path(parent) / name, there / name)
+            yield
+
+
 def flush_path(path: Path) -> None:
     """Write a file, or the names in a folder, to the disk."""
     if sys.platform == "win32" and path.is_dir():

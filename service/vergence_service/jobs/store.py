@@ -4,9 +4,10 @@
 
     DIRECTORY/jobs.sqlite3        one row per job; a job is accepted when its row is committed
     DIRECTORY/incoming/ID/        uploads that are not accepted yet; removed at every start
-    DIRECTORY/jobs/ID/input       the unpacked upload; removed when the job ends
+    DIRECTORY/jobs/ID/input       the unpacked upload; removed when the job ends, unless it is kept
     DIRECTORY/jobs/ID/passes      maps to be fused; removed when the job ends
     DIRECTORY/jobs/ID/checkpoint  progress, see :mod:`vergence_service.jobs.checkpoints`
+    DIRECTORY/jobs/ID/archives    see :mod:`vergence_service.jobs.archive_index`
     DIRECTORY/jobs/ID/result      see :mod:`vergence_service.jobs.results`
 """
 
@@ -168,7 +169,7 @@ class JobStore:
 
     def tidy(self, job: Job) -> None:
         """Remove the files that an ended job does not need; the next start tries again."""
-        for name in ("input", "passes"):
+        for name in ("passes",) if job.keep_input else ("input", "passes"):
             remove_folder(self.folder(job.job_id) / name)
         with suppress(OSError):
             (self.folder(job.job_id) / "checkpoint").unlink(missing_ok=True)

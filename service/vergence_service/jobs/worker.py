@@ -18,6 +18,7 @@ from vergence_proto.jobs import JobState
 from vergence_service.failures import error_of
 from vergence_service.jobs.checkpoints import saved_frames
 from vergence_service.jobs.job import Job
+from vergence_service.jobs.kept_uploads import KeptUploads
 from vergence_service.jobs.progress import JobProgress
 from vergence_service.jobs.registry import JobRegistry
 from vergence_service.jobs.results import read_records
@@ -48,10 +49,13 @@ class _Run:
 
 
 class JobWorker:
-    """Steps the oldest jobs: as many as the model has lanes, or one beside live streams."""
+    """Steps the first jobs of the queue: as many as the model has lanes, or one beside streams."""
 
-    def __init__(self, engine: DepthEngine, jobs: JobRegistry, *, checkpoint_s: float) -> None:
+    def __init__(
+        self, engine: DepthEngine, jobs: JobRegistry, *, checkpoint_s: float, uploads: KeptUploads
+    ) -> None:
         self._engine = engine
+        self._uploads = uploads
         self._jobs = jobs
         self._checkpoint_s = checkpoint_s
         self._runs: dict[str, _Run] = {}
@@ -98,7 +102,7 @@ class JobWorker:
                 run.task = tasks.create_task(self._run(job, run), name=f"sequence {job.job_id}")
 
     def _next(self) -> Job | None:
-        """Return the job to run now, the oldest that waits, or None if none may run."""
+        """Return the job to run now, the first that waits, or None if none may run."""
         stepping = sum(not run.stepped for run in self._runs.values())
         # A job is stepped while the one before it is finished, for disks can be slow. More than
         # one that is being finished keep others waiting.
@@ -232,9 +236,10 @@ class JobWorker:
     async def _expire_regularly(self) -> None:
         while True:
             await self._jobs.expire()
-            await asyncio.sleep(
-                max(self._jobs.next_expiry_s(within_s=_EXPIRE_EVERY_S), _LEAST_EXPIRE_S)
-            )
+            upload_s = await self._engine.threads.background.run(self._uploads.expire)
+            wait_s = self._jobs.next_expiry_s(within_s=_EXPIRE_EVERY_S)
+            wait_s = wait_s if upload_s is None else min(wait_s, upload_s)
+            await asyncio.sleep(max(wait_s, _LEAST_EXPIRE_S))
 
 
 def _given_up(job: Job) -> Job:

@@ -24,6 +24,7 @@ from vergence_service.jobs.results import frame_path, read_made, read_records
 from vergence_service.threads import ThreadPool
 from vergence_service.transports.callers import CALLER
 from vergence_service.transports.http.errors import PROBLEM_RESPONSE
+from vergence_service.transports.http.ranges import ranged
 
 NDJSON = "application/x-ndjson"
 _MAP_FORMATS = {
@@ -210,7 +211,4 @@ def _file_of(data: bytes, folder: Path, file: FrameFile, status: JobStatus) -> t
 
 
 def _tagged(request: Request, content: bytes, tag: int, media_type: str) -> Response:
-    headers = {"ETag": f'"{tag:08x}"', "Cache-Control": _CACHED}
-    if headers["ETag"] in request.headers.get("if-none-match", ""):
-        return Response(status_code=304, headers=headers)
-    return Response(content, media_type=media_type, headers=headers)
+    return ranged(request, content, f'"{tag:08x}"', media_type, {"Cache-Control": _CACHED})

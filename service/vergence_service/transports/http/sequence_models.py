@@ -1,12 +1,22 @@
 """The queries and answers of /v1/sequences."""
 
+from dataclasses import replace
 from datetime import UTC, datetime
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from vergence_proto.errors import ErrorCode
-from vergence_proto.jobs import JobOutput, JobState, OnError, Quality, ResultFormat, WarningKind
+from vergence_proto.jobs import (
+    JobOutput,
+    JobPriority,
+    JobState,
+    OnError,
+    Quality,
+    ResultFormat,
+    WarningKind,
+)
+from vergence_service.jobs.job import JobOptions
 from vergence_service.jobs.progress import JobStatus
 from vergence_service.transports.http.pages import LABEL
 
@@ -27,6 +37,8 @@ _EXAMPLE: dict[str, JsonValue] = {
     "on_error": "skip",
     "iterations": 0,
     "quality": "fast",
+    "priority": "normal",
+    "keep_input": False,
     "metrics": False,
     "accuracy": None,
     "frames_failed": 0,
@@ -39,22 +51,11 @@ _EXAMPLE: dict[str, JsonValue] = {
 }
 
 
-class SubmitQuery(BaseModel):
-    """The options of a submission."""
+class OptionsQuery(BaseModel):
+    """The options of a job."""
 
     model_config = ConfigDict(extra="forbid")
 
-    source: str | None = Field(
-        default=None,
-        description="the sequence as KIND:PATH in the archive, for example vergence:room or "
-        "kitti:sequences/00; needed if the archive contains several",
-    )
-    upload: str | None = Field(
-        default=None,
-        max_length=64,
-        description="id of a complete upload of /v1/uploads, in place of a body",
-    )
-    model: str | None = Field(default=None, description="refuse unless the server runs this model")
     iterations: int = Field(
         default=0, ge=0, le=64, description="iterations of a single pair; 0: the default"
     )
@@ -70,15 +71,62 @@ class SubmitQuery(BaseModel):
     on_error: OnError = Field(
         default=OnError.SKIP, description="what a frame does that cannot be read or stepped"
     )
+    metrics: bool = Field(default=False, description="compare with the ground truth in the archive")
     name: str = Field(default="", max_length=200, description="your name for the job")
     label: list[Annotated[str, Field(pattern=LABEL)]] = Field(
         default=[], max_length=16, description="your labels for the job, KEY:VALUE"
     )
-    metrics: bool = Field(default=False, description="compare with the ground truth in the archive")
+    priority: JobPriority = Field(
+        default=JobPriority.NORMAL, description="which of the waiting jobs is next"
+    )
+    keep_input: bool = Field(
+        default=False, description="keep the upload as long as the result, for `rerun`"
+    )
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """The labels by their key."""
+        return dict(label.split(":", 1) for label in self.label)
+
+    def options(self, before: JobOptions | None = None) -> JobOptions:
+        """Return the options of the job; those not stated are as in ``before``."""
+        stated: dict[str, Any] = {
+            "iterations": self.iterations,
+            "quality": self.quality,
+            "outputs": _kept(self.output),
+            "metrics": self.metrics,
+            "on_error": self.on_error,
+        }
+        if before is None:
+            return JobOptions(**stated)
+        named = {"outputs" if name == "output" else name for name in self.model_fields_set}
+        return replace(before, **{name: stated[name] for name in named & stated.keys()})
+
+
+class SubmitQuery(OptionsQuery):
+    """The options of a submission."""
+
+    source: str | None = Field(
+        default=None,
+        description="the sequence as KIND:PATH in the archive, for example vergence:room or "
+        "kitti:sequences/00; needed if the archive contains several",
+    )
+    upload: str | None = Field(
+        default=None,
+        max_length=64,
+        description="id of a complete upload of /v1/uploads, in place of a body",
+    )
+    model: str | None = Field(default=None, description="refuse unless the server runs this model")
     wait: bool = Field(default=False, description="answer with the result, when the job is done")
     format: ResultFormat = Field(
         default=ResultFormat.PNG16, description="format of the awaited result"
     )
+
+
+def _kept(outputs: list[JobOutput]) -> tuple[JobOutput, ...]:
+    """Return what a job keeps: points need the colours of the left image."""
+    points = [JobOutput.LEFT] if JobOutput.POINTS in outputs else []
+    return tuple(dict.fromkeys([*outputs, *points]))
 
 
 class ResultQuery(BaseModel):
@@ -118,6 +166,8 @@ class SequenceJob(BaseModel):
     on_error: OnError
     iterations: int
     quality: Quality
+    priority: JobPriority
+    keep_input: bool
     metrics: bool
     accuracy: dict[str, float] | None = Field(description="mean over the frames with ground truth")
     frames_failed: int = Field(
@@ -154,6 +204,8 @@ class SequenceJob(BaseModel):
             on_error=job.options.on_error,
             iterations=job.options.iterations,
             quality=job.options.quality,
+            priority=job.priority,
+            keep_input=job.keep_input,
             metrics=job.options.metrics,
             accuracy=None if job.accuracy is None else dict(job.accuracy),
             frames_failed=job.frames_failed,

@@ -1,9 +1,7 @@
 """The routes of /v1/sequences: submit a sequence, follow its job, download its result."""
 
 import asyncio
-from collections.abc import AsyncGenerator, AsyncIterator, Iterator
-from contextlib import aclosing
-from pathlib import Path
+from collections.abc import AsyncIterator
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
@@ -15,9 +13,8 @@ from vergence_proto.errors import (
     SequenceNotDone,
     UnknownSequence,
 )
-from vergence_proto.jobs import JobOutput, JobState, ResultFormat
-from vergence_service.jobs.archive import CannotEncode, mp4_of, zip_of
-from vergence_service.jobs.job import Job, JobOptions
+from vergence_proto.jobs import JobState
+from vergence_service.jobs.job import Job
 from vergence_service.jobs.progress import JobStatus
 from vergence_service.jobs.queue import JobOrder, JobQueue
 from vergence_service.jobs.registry import JobRegistry
@@ -27,7 +24,13 @@ from vergence_service.transports.http.errors import PROBLEM_RESPONSE
 from vergence_service.transports.http.frame_routes import frame_routes
 from vergence_service.transports.http.idempotency import KeysInUse, Submission, check_digest
 from vergence_service.transports.http.pages import ListQuery
-from vergence_service.transports.http.sequence_models import ResultQuery, SequenceJob, SubmitQuery
+from vergence_service.transports.http.result_download import ResultDownloads
+from vergence_service.transports.http.sequence_models import (
+    OptionsQuery,
+    ResultQuery,
+    SequenceJob,
+    SubmitQuery,
+)
 from vergence_service.transports.http.tus import tus_routes
 from vergence_service.transports.http.uploads import (
     ARCHIVE_TYPES,
@@ -69,7 +72,11 @@ _RESULT: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "A zip with one file per frame and output; with format=mp4 a film",
         "content": {"application/zip": _BINARY, "video/mp4": _BINARY},
-    }
+    },
+    206: {
+        "description": "The part that `Range` asks for",
+        "content": {"application/zip": _BINARY, "video/mp4": _BINARY},
+    },
 }
 _ACCEPTED: dict[int | str, dict[str, Any]] = {
     202: {
@@ -84,6 +91,7 @@ def sequence_routes(
 ) -> APIRouter:
     """Make the routes. ``stopping`` ends the answers that wait for a job while the server stops."""
     jobs, threads, keys = queue.jobs, queue.threads, KeysInUse()
+    downloads = ResultDownloads(jobs, threads)
     router = APIRouter(tags=["sequences"], responses=PROBLEM_RESPONSE)
 
     @router.post(
@@ -105,15 +113,12 @@ def sequence_routes(
         submission = Submission.of(request, caller)
         order = JobOrder(
             source=query.source,
-            options=JobOptions(
-                iterations=query.iterations,
-                quality=query.quality,
-                outputs=_kept(query.output),
-                metrics=query.metrics,
-                on_error=query.on_error,
-            ),
+            options=query.options(),
+            upload=query.upload or "",
+            priority=query.priority,
+            keep_input=query.keep_input,
             name=query.name,
-            labels=dict(label.split(":", 1) for label in query.label),
+            labels=query.labels,
             key=submission.key,
             key_fingerprint=submission.fingerprint,
         )
@@ -148,7 +153,7 @@ def sequence_routes(
                     "its result keeps the frames before"
                 )
             if status.job.ended:
-                return await _result(jobs, job_id, query.format, threads)
+                return await downloads.answer(request, job_id, query.format)
         return JSONResponse(
             SequenceJob.of(status).model_dump(mode="json"),
             status_code=202,
@@ -188,6 +193,34 @@ def sequence_routes(
         jobs.check_owner(job_id, CALLER.get())
         return SequenceJob.of(await queue.cancel(job_id))
 
+    @router.post(
+        "/v1/sequences/{job_id}/rerun",
+        operation_id="rerun_sequence",
+        status_code=202,
+        responses=_ACCEPTED,
+    )
+    async def rerun(
+        request: Request, job_id: str, query: Annotated[OptionsQuery, Query()]
+    ) -> SequenceJob:
+        """Submit the input of a job again, with other options. It must have kept its input."""
+        client, caller = client_of(request), CALLER.get()
+        jobs.check_owner(job_id, caller)
+        before = jobs.get(job_id)
+        order = JobOrder(
+            source=before.source,
+            options=query.options(before.options),
+            priority=query.priority,
+            keep_input=query.keep_input,
+            name=query.name or before.name,
+            labels=query.labels or before.labels,
+        )
+        async with queue.upload_folder(client, upload_bytes=0, owner=caller) as folder:
+            await queue.link_input(job_id, folder)
+            status = await queue.accept(
+                folder, order, upload_sha256=before.upload_sha256, client=client, owner=caller
+            )
+        return SequenceJob.of(status)
+
     @router.get("/v1/sequences/{job_id}", operation_id="get_sequence")
     async def get_sequence(job_id: str) -> SequenceJob:
         """Get the state and the progress of a job."""
@@ -214,16 +247,21 @@ def sequence_routes(
             headers={"Cache-Control": "no-store"},
         )
 
+    @router.head(
+        "/v1/sequences/{job_id}/result", operation_id="measure_result", response_class=Response
+    )
     @router.get(
         "/v1/sequences/{job_id}/result",
         operation_id="get_result",
         response_class=StreamingResponse,
         responses=_RESULT,
     )
-    async def result(job_id: str, query: Annotated[ResultQuery, Query()]) -> Response:
-        """Download the result. It is encoded while it is sent."""
+    async def result(
+        request: Request, job_id: str, query: Annotated[ResultQuery, Query()]
+    ) -> Response:
+        """Download the result, or a part of it. It is encoded while it is sent."""
         jobs.check_owner(job_id, CALLER.get())
-        return await _result(jobs, job_id, query.format, threads)
+        return await downloads.answer(request, job_id, query.format)
 
     @router.delete("/v1/sequences/{job_id}", status_code=204, operation_id="delete_sequence")
     async def delete(job_id: str) -> None:
@@ -297,50 +335,3 @@ async def _change(jobs: JobRegistry, stopping: asyncio.Event) -> None:
     finally:
         for wait in waits:
             wait.cancel()
-
-
-def _kept(outputs: list[JobOutput]) -> tuple[JobOutput, ...]:
-    """Return what a job keeps: points need the colours of the left image."""
-    points = [JobOutput.LEFT] if JobOutput.POINTS in outputs else []
-    return tuple(dict.fromkeys([*outputs, *points]))
-
-
-async def _result(
-    jobs: JobRegistry, job_id: str, form: ResultFormat, threads: ThreadPool
-) -> Response:
-    job, folder = jobs.result(job_id)
-    pieces = _pieces(jobs, jobs.status(job_id), folder, form, threads)
-    try:
-        # An error of the encoder must come before the answer begins.
-        while not (first := await anext(pieces)):
-            pass
-    except CannotEncode as error:
-        raise BadShape(f"format {form}: {error}") from None
-    film = form is ResultFormat.MP4
-    name = f"{job_id}-{job.source.partition(':')[0]}.{'mp4' if film else 'zip'}"
-    return StreamingResponse(
-        _chained(first, pieces),
-        media_type="video/mp4" if film else "application/zip",
-        headers={"Content-Disposition": f'attachment; filename="{name}"'},
-    )
-
-
-async def _chained(first: bytes, rest: AsyncGenerator[bytes, None]) -> AsyncIterator[bytes]:
-    async with aclosing(rest):
-        yield first
-        async for piece in rest:
-            yield piece
-
-
-async def _pieces(
-    jobs: JobRegistry, status: JobStatus, folder: Path, form: ResultFormat, threads: ThreadPool
-) -> AsyncGenerator[bytes, None]:
-    pieces: Iterator[bytes]
-    if form is ResultFormat.MP4:
-        pieces = mp4_of(status.job, folder)
-    else:
-        pieces = await threads.run(zip_of, status, folder, form)
-    async with aclosing(threads.iterate(pieces)) as taken:
-        with jobs.reading(status.job.job_id):
-            async for piece in taken:
-                yield piece

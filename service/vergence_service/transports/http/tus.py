@@ -69,7 +69,7 @@ def tus_routes(queue: JobQueue, uploads: KeptUploads, limits: UploadLimits) -> A
                 f"expected an upload of at most {limits.max_bytes} bytes; the server's setting "
                 f"{limits.max_bytes_setting} allows more"
             )
-        await queue.jobs.check_free(upload_length, what="the upload")
+        await queue.room.check_upload(upload_length)
         upload = await threads.run(uploads.create, CALLER.get(), upload_length)
         return _answer(201, {"Location": f"/v1/uploads/{upload.upload_id}", **_state(upload)})
 

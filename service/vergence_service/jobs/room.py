@@ -1,0 +1,79 @@
+"""The disk space of jobs and uploads: what has no room is refused; no result makes room for it."""
+
+from vergence_proto.errors import QueueFull, UploadTooLarge
+from vergence_service.jobs.job import Job
+from vergence_service.jobs.kept_uploads import KeptUploads
+from vergence_service.jobs.registry import JobRegistry
+from vergence_service.jobs.storage import check_free
+from vergence_service.jobs.store import JobStore
+from vergence_service.threads import ThreadPool
+
+
+class DiskRoom:
+    """Compares what is needed with the limit of all jobs and with the free space of the disk."""
+
+    def __init__(
+        self,
+        store: JobStore,
+        jobs: JobRegistry,
+        uploads: KeptUploads,
+        *,
+        disk_bytes: int,
+        background: ThreadPool,
+    ) -> None:
+        self._store = store
+        self._jobs = jobs
+        self._uploads = uploads
+        self._disk_bytes = disk_bytes
+        self._background = background
+
+    async def check_free(self, needed_bytes: int, *, what: str) -> None:
+        """Raise InsufficientStorage unless the disk has room for ``needed_bytes`` more.
+
+        What accepted jobs and announced uploads still need is not free.
+        """
+        missing = await self._background.run(self._uploads.missing_bytes)
+        await self._background.run(
+            check_free,
+            self._store.directory,
+            needed_bytes,
+            promised_bytes=self._jobs.promised_bytes() + missing,
+            what=what,
+        )
+
+    async def check_upload(self, length: int) -> None:
+        """Refuse an upload of ``length`` bytes that does not fit beside all that is kept.
+
+        Raises UploadTooLarge if it can never fit, QueueFull if it does not fit now, and
+        InsufficientStorage if the disk has no room for it.
+        """
+        await self._check_limit(length, what="the upload", upload="")
+        await self.check_free(length, what="the upload")
+
+    async def check_job(self, new: Job, *, upload: str = "") -> None:
+        """Refuse a job that does not fit beside all results that have not expired.
+
+        Its input is on the disk already; ``upload`` is the id of the upload that it came in, which
+        is deleted next. Raises UploadTooLarge if the job can never fit, QueueFull if it does not
+        fit now, and InsufficientStorage if the disk has no room for its result.
+        """
+        await self._check_limit(new.disk_bytes, what="the sequence and its result", upload=upload)
+        await self.check_free(new.result_bytes, what="the result of the sequence")
+
+    async def _check_limit(self, needed: int, *, what: str, upload: str) -> None:
+        if needed > self._disk_bytes:
+            raise UploadTooLarge(
+                f"{what} need {needed} bytes, the server keeps {self._disk_bytes} for all "
+                "sequences; send it in parts, or start the server with a larger batch.disk_mib"
+            )
+        await self._jobs.expire()
+        held = await self._background.run(self._uploads.held_bytes, upload)
+        used = self._jobs.used_bytes() + held
+        if used + needed > self._disk_bytes:
+            raise QueueFull(
+                f"sequences, their results and uploads use {used} of {self._disk_bytes} bytes on "
+                f"disk, {what} need {needed}, and no result is deleted before it expires; fetch "
+                "and delete results, or try again later (the server's settings batch.disk_mib, "
+                "batch.keep_h)",
+                retry_after_s=self._jobs.room_in_s(),
+            )
