@@ -62,6 +62,7 @@ class BatchClient:
         iterations: int = 0,
         quality: Literal["fast", "steady", "best"] = "fast",
         metrics: bool = False,
+        webhook: str = "",
         rig: RectifiedRig | None = None,
         fps: float = 30.0,
     ) -> "BatchJob":
@@ -77,6 +78,7 @@ class BatchClient:
                 iterations=iterations,
                 quality=quality,
                 metrics=metrics,
+                webhook=webhook,
                 rig=rig,
                 fps=fps,
             )

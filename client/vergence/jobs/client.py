@@ -100,6 +100,7 @@ class AsyncBatchClient:
         iterations: int = 0,
         quality: Literal["fast", "steady", "best"] = "fast",
         metrics: bool = False,
+        webhook: str = "",
         rig: RectifiedRig | None = None,
         fps: float = 30.0,
     ) -> "AsyncBatchJob":
@@ -127,6 +128,8 @@ class AsyncBatchClient:
             poses.
         metrics
             Compare with the ground truth of the sequence.
+        webhook
+            The address that hears of the end of the job, if the server allows its host.
         rig, fps
             The rectified rig and the frame rate of arrays.
 
@@ -147,6 +150,7 @@ class AsyncBatchClient:
             "iterations": iterations,
             "quality": quality,
             "metrics": metrics,
+            "webhook": webhook,
         }
         with ExitStack() as stack:
             upload = await asyncio.to_thread(_upload_of, source, stack, rig, fps)

@@ -130,6 +130,7 @@ async def serving_http(
                         keep_s=batch.keep_h * 3600,
                         disk_bytes=batch.disk_mib * _MIB,
                         principal_bytes=settings.limits.sequences_mib * _MIB,
+                        webhook_hosts=batch.webhook_hosts,
                     ),
                 )
             )

@@ -45,6 +45,8 @@ class Job:
     labels: Mapping[str, str] = field(default_factory=dict)  # the client's own
     priority: JobPriority = JobPriority.NORMAL
     keep_input: bool = False  # until the result expires, for another run
+    webhook: str = ""  # address that hears of the end
+    webhook_result: str = ""  # empty: not sent yet
     key: str = ""  # the client's key of the submission, so that it is not accepted twice
     key_fingerprint: str = ""  # of the request with this key
     options: JobOptions = field(default_factory=JobOptions)

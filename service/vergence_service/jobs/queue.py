@@ -4,7 +4,7 @@ import dataclasses
 import logging
 import secrets
 import time
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -34,6 +34,7 @@ from vergence_service.jobs.storage import linking
 from vergence_service.jobs.store import JobStore, folder_bytes, remove_folder
 from vergence_service.jobs.tally import tally_of
 from vergence_service.jobs.upload_checks import checking_folder
+from vergence_service.jobs.webhooks import WebhookHosts, WebhookSender
 from vergence_service.jobs.worker import JobWorker
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.threads import to_the_end
@@ -52,6 +53,7 @@ class QueueLimits:
     keep_s: float  # time that ended jobs are kept
     disk_bytes: int  # disk space
     principal_bytes: int  # the same of one principal that has shown a credential
+    webhook_hosts: Sequence[str] = ()  # hosts that webhooks may go to
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,6 +65,7 @@ class JobOrder:
     upload: str = ""  # id of the upload that it came in, if that arrived in parts
     priority: JobPriority = JobPriority.NORMAL
     keep_input: bool = False  # for another run
+    webhook: str = ""  # address that hears of the end
     name: str = ""
     labels: Mapping[str, str] = field(default_factory=dict)
     key: str = ""  # so that a repeated submission is not accepted twice
@@ -97,6 +100,10 @@ class JobQueue:
         self._worker = JobWorker(
             engine, self.jobs, checkpoint_s=limits.checkpoint_s, uploads=self.uploads
         )
+        self._webhook_hosts = WebhookHosts(limits.webhook_hosts)
+        self._webhooks = WebhookSender(
+            self.jobs, self._webhook_hosts, secret_file=store.directory / "webhook_secret"
+        )
         # Owner and client of the jobs that are being added.
         self._accepting: list[tuple[str, str]] = []
 
@@ -111,10 +118,17 @@ class JobQueue:
     def start(self) -> None:
         """Run the waiting jobs, those of earlier servers first."""
         self._worker.start()
+        self._webhooks.start()
 
     async def stop(self) -> None:
         """Run no more jobs. The running one keeps its place and its progress."""
         await self._worker.stop()
+        await self._webhooks.stop()
+
+    async def check_webhook(self, webhook: str) -> None:
+        """Raise BadShape unless messages may go to this address; empty: there are none."""
+        if webhook:
+            await self._webhook_hosts.target(webhook)
 
     @asynccontextmanager
     async def upload_folder(
@@ -214,6 +228,7 @@ class JobQueue:
             labels=order.labels,
             priority=order.priority,
             keep_input=order.keep_input,
+            webhook=order.webhook,
             key=order.key,
             key_fingerprint=order.key_fingerprint,
             options=options,

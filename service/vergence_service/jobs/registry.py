@@ -273,6 +273,21 @@ class JobRegistry:
         # Only now: a server that is killed before the row is written needs the input again.
         await self._background.run(self._store.tidy, job)
 
+    def owing_webhooks(self) -> list[Job]:
+        """Return the ended jobs whose webhook is neither delivered nor given up."""
+        return [
+            job
+            for job in self._jobs.values()
+            if job.webhook and not job.webhook_result and job.finished_s is not None
+        ]
+
+    async def note_webhook(self, job_id: str, result: str) -> None:
+        """Record what became of the webhook of an ended job, unless it was deleted."""
+        if job_id in self._jobs:
+            job = self._jobs[job_id] = replace(self._jobs[job_id], webhook_result=result)
+            await self._background.run(self._store.update, job)
+            self._notify_changed()
+
     def hide(self, job_id: str) -> None:
         """Make a job unknown to readers at once; :meth:`delete` follows. Raises UnknownSequence."""
         self.get(job_id)

@@ -3,6 +3,7 @@
 ::
 
     DIRECTORY/jobs.sqlite3        one row per job; a job is accepted when its row is committed
+    DIRECTORY/webhook_secret      signs webhooks, see :mod:`vergence_service.jobs.webhooks`
     DIRECTORY/incoming/ID/        uploads that are not accepted yet; removed at every start
     DIRECTORY/jobs/ID/input       the unpacked upload; removed when the job ends, unless it is kept
     DIRECTORY/jobs/ID/passes      maps to be fused; removed when the job ends

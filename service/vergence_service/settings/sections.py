@@ -270,3 +270,6 @@ class BatchSettings(Section):
     idle_s: PositiveFloat = Field(
         default=30.0, description="abort an upload that sends nothing for this long"
     )
+    webhook_hosts: list[str] = Field(
+        default=[], description='hosts that webhooks may go to; "*": any with a public address'
+    )

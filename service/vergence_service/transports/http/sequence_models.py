@@ -39,6 +39,8 @@ _EXAMPLE: dict[str, JsonValue] = {
     "quality": "fast",
     "priority": "normal",
     "keep_input": False,
+    "webhook": "",
+    "webhook_result": None,
     "metrics": False,
     "accuracy": None,
     "frames_failed": 0,
@@ -81,6 +83,12 @@ class OptionsQuery(BaseModel):
     )
     keep_input: bool = Field(
         default=False, description="keep the upload as long as the result, for `rerun`"
+    )
+
+    webhook: str = Field(
+        default="",
+        max_length=2000,
+        description="https address that gets a signed message when the job ends",
     )
 
     @property
@@ -168,6 +176,10 @@ class SequenceJob(BaseModel):
     quality: Quality
     priority: JobPriority
     keep_input: bool
+    webhook: str
+    webhook_result: str | None = Field(
+        description="delivered, given up, or null while neither is known"
+    )
     metrics: bool
     accuracy: dict[str, float] | None = Field(description="mean over the frames with ground truth")
     frames_failed: int = Field(
@@ -206,6 +218,8 @@ class SequenceJob(BaseModel):
             quality=job.options.quality,
             priority=job.priority,
             keep_input=job.keep_input,
+            webhook=job.webhook,
+            webhook_result=job.webhook_result or None,
             metrics=job.options.metrics,
             accuracy=None if job.accuracy is None else dict(job.accuracy),
             frames_failed=job.frames_failed,

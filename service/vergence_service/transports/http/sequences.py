@@ -109,6 +109,7 @@ def sequence_routes(
         """
         if query.model not in (None, model):
             raise BadShape(f"expected {model}, the model of this server, got {query.model!r}")
+        await queue.check_webhook(query.webhook)
         client, caller = client_of(request), CALLER.get()
         submission = Submission.of(request, caller)
         order = JobOrder(
@@ -117,6 +118,7 @@ def sequence_routes(
             upload=query.upload or "",
             priority=query.priority,
             keep_input=query.keep_input,
+            webhook=query.webhook,
             name=query.name,
             labels=query.labels,
             key=submission.key,
@@ -203,6 +205,7 @@ def sequence_routes(
         request: Request, job_id: str, query: Annotated[OptionsQuery, Query()]
     ) -> SequenceJob:
         """Submit the input of a job again, with other options. It must have kept its input."""
+        await queue.check_webhook(query.webhook)
         client, caller = client_of(request), CALLER.get()
         jobs.check_owner(job_id, caller)
         before = jobs.get(job_id)
@@ -211,6 +214,7 @@ def sequence_routes(
             options=query.options(before.options),
             priority=query.priority,
             keep_input=query.keep_input,
+            webhook=query.webhook,
             name=query.name or before.name,
             labels=query.labels or before.labels,
         )
