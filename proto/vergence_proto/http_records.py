@@ -1,4 +1,4 @@
-"""StreamDepth over HTTP: one long response of records, and one request per message.
+"""StreamDepth over HTTP: one long response of records, and one long request or one per message.
 
 ::
 
@@ -9,6 +9,12 @@
     POST /v1/methods/{method}   the other methods of DepthService
 
 A record is one byte with its kind, four bytes with its length (big-endian), and the content.
+
+The body of ``POST /v1/streams/{call}`` is one message of ``application/x-protobuf``, or any number
+of them as records, in a body that lasts as long as the call, if its type is
+``application/vnd.vergence.records``. A server that takes records says so in the header Accept-Post
+of its first response. Some proxies pass a body on only when it is whole: a client that hears no
+answer then sends one message per request, as a browser does.
 """
 
 import struct
@@ -18,6 +24,9 @@ from enum import IntEnum
 PROTOBUF_TYPE = "application/x-protobuf"
 RECORDS_TYPE = "application/vnd.vergence.records"
 CALL_ID_HEADER = "X-Call-Id"
+ACCEPT_POST_HEADER = "Accept-Post"
+
+RECORD_HEAD_BYTES = 5
 
 _HEAD = struct.Struct(">BI")
 
@@ -26,9 +35,18 @@ class RecordKind(IntEnum):
     """The kind of a record, its first byte."""
 
     MESSAGE = 0
-    """A StreamDepthResponse."""
+    """A StreamDepthResponse, or in a request a StreamDepthRequest."""
     END = 1
     """The end of the call: empty after success, else a FrameError with the reason."""
+
+
+def read_head(head: bytes | bytearray) -> tuple[RecordKind, int]:
+    """Return the kind of a record and its length without the head.
+
+    Raises ValueError: there is no such kind.
+    """
+    kind, length = _HEAD.unpack_from(head)
+    return RecordKind(kind), length
 
 
 def pack_record(kind: RecordKind, content: bytes) -> bytes:

@@ -13,7 +13,7 @@ root; else it is a proxy that shapes the bytes (``"link": "proxy"``). Per link:
 - ``today_results_hz today_age_p95_ms``: the defaults of version 0.1, raw colour and full maps.
 - ``epe_ratio_covered epe_ratio_all covered``: the end-point error of ``depth_at`` at the pose of
   the moment over that of a map of the moment, where a result saw the surface and everywhere.
-- ``depth_at_ms``: the time of one ``depth_at`` at 640x480.
+- ``depth_at_ms``: the processor's time of one ``depth_at`` at 640x480, all threads together.
 
 ``--opens`` opens sessions over gRPC, HTTP and Zenoh (over TCP, without shared memory) instead:
 ``opened`` of ``tried`` at round trips of 60, 150 and 300 ms, and at 8 Mbit/s.
@@ -88,6 +88,7 @@ class Place:
     client: Sequence[str]
     server: Sequence[str]
     host: str
+    transport: str = "grpc"
     stalls_from_s: float = 0.0
 
 
@@ -104,13 +105,13 @@ def python(prefix: Sequence[str], *arguments: str) -> "subprocess.Popen[str]":
 
 @contextmanager
 def serving(place: Place, maps: Path) -> Iterator[str]:
-    """A server with recorded maps; yields its gRPC address."""
+    """A server with recorded maps; yields its address over the transport."""
     with python(
         place.server, "-m", "tests.support.recorded_model", str(maps), place.host
     ) as process:
         assert process.stdout is not None
         try:
-            yield process.stdout.readline().split()[0]
+            yield process.stdout.readline().split()[place.transport == "http"]
         finally:
             process.terminate()
 
@@ -191,10 +192,10 @@ def play(place: Place, plan: Plan) -> dict[str, Any]:
 def measure(place: Place, shape: LinkShape, maps: Path, seconds: float) -> dict[str, Any]:
     with serving(place, maps) as address:
         if place.client:
-            return clients(place, f"grpc://{address}", shape, maps, seconds)
+            return clients(place, f"{place.transport}://{address}", shape, maps, seconds)
         with shaped_proxy(address, shape) as (proxy, started_s):
             place = replace(place, stalls_from_s=started_s)
-            return clients(place, f"grpc://{proxy}", shape, maps, seconds)
+            return clients(place, f"{place.transport}://{proxy}", shape, maps, seconds)
 
 
 def clients(
@@ -229,10 +230,13 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
             shape = LINKS[name]
             if args.link == "tun":
                 with tun_link(shape) as link:
-                    place = Place(link.client, link.server, SERVER_IP, link.started_s)
+                    place = Place(
+                        link.client, link.server, SERVER_IP, args.transport, link.started_s
+                    )
                     figures[name] = measure(place, shape, maps, args.seconds)
             else:
-                figures[name] = measure(Place((), (), "127.0.0.1"), shape, maps, args.seconds)
+                place = Place((), (), "127.0.0.1", args.transport)
+                figures[name] = measure(place, shape, maps, args.seconds)
             show(name, figures[name])
     return figures
 
@@ -250,6 +254,7 @@ def main() -> None:
     parser.add_argument(
         "--link", choices=("tun", "proxy"), default="tun" if can_make_links() else "proxy"
     )
+    parser.add_argument("--transport", choices=("grpc", "http"), default="grpc")
     parser.add_argument("--opens", type=int, nargs="?", const=20, metavar="COUNT")
     parser.add_argument("--ends", type=int, nargs="?", const=500, metavar="COUNT")
     parser.add_argument("--outages", nargs="*", choices=OUTAGES)

@@ -9,10 +9,12 @@ class Proxy:
     """Forwards bytes both ways to one address until it is cut.
 
     ``delay_s`` is the time of a byte from one end to the other; a new connection takes a round trip
-    before its first byte, as TCP's handshake does.
+    before its first byte, as TCP's handshake does. With ``whole_requests`` an HTTP request of
+    unknown length does not arrive, because its end does not come.
     """
 
-    def __init__(self, target: str, *, delay_s: float = 0.0) -> None:
+    def __init__(self, target: str, *, delay_s: float = 0.0, whole_requests: bool = False) -> None:
+        self._whole_requests = whole_requests
         self._target = target
         self._delay_s = delay_s
         self._connections: set[asyncio.Task[None]] = set()
@@ -105,7 +107,11 @@ class Proxy:
         arriving = asyncio.create_task(arrive())
         try:
             with suppress(OSError):
+                endless = False
                 while data := await reader.read(1 << 16):
+                    endless |= self._whole_requests and len(gates) > 1 and b"chunked" in data
+                    if endless:
+                        continue
                     travelling.put_nowait((loop.time() + self._delay_s, data))
                 travelling.put_nowait((loop.time() + self._delay_s, b""))
                 if not self._dead.intersection(gates):
@@ -128,8 +134,10 @@ def _open_gate() -> asyncio.Event:
 
 
 @asynccontextmanager
-async def proxy_to(target: str, *, delay_s: float = 0.0) -> AsyncIterator[Proxy]:
-    proxy = Proxy(target, delay_s=delay_s)
+async def proxy_to(
+    target: str, *, delay_s: float = 0.0, whole_requests: bool = False
+) -> AsyncIterator[Proxy]:
+    proxy = Proxy(target, delay_s=delay_s, whole_requests=whole_requests)
     server = await asyncio.start_server(proxy.serve, "127.0.0.1", 0)
     proxy.address = f"127.0.0.1:{server.sockets[0].getsockname()[1]}"
     try:

@@ -1,5 +1,6 @@
 """The HTTP transport, for restricted networks: see :mod:`vergence_proto.http_records`."""
 
+import asyncio
 from collections import deque
 from collections.abc import AsyncIterator, Callable
 from typing import Any
@@ -14,10 +15,13 @@ from vergence.transports.proxies import through_proxy
 from vergence_proto import codec
 from vergence_proto.errors import DepthError, NotReady, error_from_wire
 from vergence_proto.http_records import (
+    ACCEPT_POST_HEADER,
     CALL_ID_HEADER,
     PROTOBUF_TYPE,
+    RECORDS_TYPE,
     RecordKind,
     RecordReader,
+    pack_record,
 )
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.zenoh.keys import STREAM_ID_METADATA
@@ -48,19 +52,25 @@ class HttpTransport:
         self._tls = shown.tls()  # one for all connections: it takes 20 ms to make
         self._http = self._connections()
         self._calls: set[_HttpCall] = set()
+        self._long_uploads = True
 
     async def open_call(self, stream_id: str) -> Call:
         self._check_open()
         # Connections of its own, because those of another call may be dead without knowing it.
-        call = _HttpCall(self._connections(), stream_id)
+        call = _HttpCall(self._connections(), stream_id, long_upload=self._long_uploads)
         try:
             await call.connect()
         except BaseException:
             await call.close()
             raise
         self._calls.add(call)
-        call.closed = self._calls.discard
+        call.closed = self._closed
         return call
+
+    def _closed(self, call: "_HttpCall") -> None:
+        self._calls.discard(call)
+        if call.unheard:  # perhaps a proxy waits for the end of a long upload
+            self._long_uploads = not call.long_upload
 
     def _connections(self) -> httpx.AsyncClient:
         return http_client(
@@ -93,7 +103,9 @@ class HttpTransport:
 
 
 class _HttpCall:
-    def __init__(self, http: httpx.AsyncClient, stream_id: str) -> None:
+    def __init__(self, http: httpx.AsyncClient, stream_id: str, *, long_upload: bool) -> None:
+        self.long_upload = long_upload
+        self.unheard = False  # something was sent after the opening, and nothing has come since
         self.closed: Callable[[_HttpCall], None] = _nothing
         self._http = http
         self._headers = {**_HEADERS, STREAM_ID_METADATA: stream_id}
@@ -102,6 +114,9 @@ class _HttpCall:
         self._reader = RecordReader()
         self._records: deque[tuple[RecordKind, bytes]] = deque()
         self._error: DepthError | None = None  # for receive to raise
+        self._upload: asyncio.Task[None] | None = None
+        self._to_upload: asyncio.Queue[bytes] = asyncio.Queue(1)
+        self._heard = 0
 
     async def connect(self) -> None:
         """Connect; the answer does not matter, and the call uses the same connection."""
@@ -115,11 +130,8 @@ class _HttpCall:
             if self._answer is None:
                 await self._open(request)
             elif self._error is None:
-                call_id = self._answer.headers[CALL_ID_HEADER]
-                # Errors of this request arrive in the call's own answer.
-                await self._http.post(
-                    f"/v1/streams/{call_id}", content=request, headers=self._headers
-                )
+                self.unheard = self._heard <= 1
+                await self._send(request, self._answer.headers)
         except httpx.TransportError as error:
             self._error = _lost(self._http, error)
 
@@ -136,6 +148,8 @@ class _HttpCall:
         except (httpx.TransportError, httpx.StreamError) as error:
             raise _lost(self._http, error) from None
         kind, content = self._records.popleft()
+        self._heard += 1
+        self.unheard = self.unheard and self._heard <= 1
         if kind is RecordKind.MESSAGE:
             return pb.StreamDepthResponse.FromString(content)
         if content:
@@ -145,9 +159,38 @@ class _HttpCall:
     async def close(self) -> None:
         self._error = self._error or ConnectionLost("the call was closed")
         self.closed(self)
+        if self._upload is not None:
+            self._upload.cancel()
+            await asyncio.gather(self._upload, return_exceptions=True)
         if self._answer is not None:
             await self._answer.aclose()
         await self._http.aclose()
+
+    async def _send(self, request: bytes, opened: httpx.Headers) -> None:
+        # Errors of these requests arrive in the call's own answer.
+        path = f"/v1/streams/{opened[CALL_ID_HEADER]}"
+        if not self.long_upload or RECORDS_TYPE not in opened.get(ACCEPT_POST_HEADER, ""):
+            await self._http.post(path, content=request, headers=self._headers)
+            return
+        if self._upload is None:
+            self._upload = asyncio.create_task(self._upload_all(path), name="vergence upload")
+        queued = asyncio.create_task(self._to_upload.put(pack_record(RecordKind.MESSAGE, request)))
+        try:
+            await asyncio.wait([queued, self._upload], return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            queued.cancel()
+        if self._upload.done():
+            self._upload.result()
+
+    async def _upload_all(self, path: str) -> None:
+        """Send what is queued in one request; it ends when the server has ended the call."""
+
+        async def records() -> AsyncIterator[bytes]:
+            while True:
+                yield await self._to_upload.get()
+
+        headers = {**self._headers, "Content-Type": RECORDS_TYPE}
+        await self._http.post(path, content=records(), headers=headers)
 
     async def _open(self, request: bytes) -> None:
         post = self._http.build_request(

@@ -17,7 +17,7 @@ from starlette.responses import RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from vergence_proto.errors import BadShape, DepthError, Forbidden
-from vergence_proto.http_records import PROTOBUF_TYPE
+from vergence_proto.http_records import PROTOBUF_TYPE, RECORDS_TYPE
 from vergence_service.access.gate import Gate
 from vergence_service.transports.callers import CALLER
 from vergence_service.transports.http.admin import LOGIN, Logins
@@ -27,6 +27,7 @@ from vergence_service.transports.http.errors import refusal_of
 _OPEN_PATHS = {"/healthz", "/readyz"}
 _LOGIN_PATHS = {LOGIN, "/assets/page.css"}
 _PROTOBUF_PATHS = ("/v1/streams", "/v1/methods/")
+_CALL_PATHS = "/v1/streams/"
 _HEADERS: Mapping[str, str] = {
     "X-Content-Type-Options": "nosniff",
     "Cross-Origin-Resource-Policy": "same-origin",
@@ -118,7 +119,8 @@ class Border:
         CALLER.set(caller)
         if scope["method"] == "POST" and scope["path"].startswith(_PROTOBUF_PATHS):
             kind = headers.get("content-type", "").partition(";")[0].strip().lower()
-            if kind != PROTOBUF_TYPE:
+            call = scope["path"].startswith(_CALL_PATHS)
+            if kind != PROTOBUF_TYPE and not (call and kind == RECORDS_TYPE):
                 raise BadShape(f"expected a body of {PROTOBUF_TYPE}, got {kind[:100]!r}")
 
 

@@ -16,6 +16,7 @@ from vergence_proto import codec
 from vergence_proto.codec.requests import MAX_SMALL_BYTES
 from vergence_proto.errors import BadShape, DepthError, FrameTooLarge, UnknownStream
 from vergence_proto.http_records import (
+    ACCEPT_POST_HEADER,
     CALL_ID_HEADER,
     PROTOBUF_TYPE,
     RECORDS_TYPE,
@@ -26,7 +27,7 @@ from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.access.principals import Principal
 from vergence_service.failures import error_of
 from vergence_service.transports.callers import CALLER
-from vergence_service.transports.http.bodies import body_of
+from vergence_service.transports.http.bodies import body_of, messages_of
 from vergence_service.transports.http.errors import PROBLEM_RESPONSE, log
 from vergence_service.transports.http.uploads import client_of
 from vergence_service.transports.open_calls import OpenCalls
@@ -39,6 +40,15 @@ _BODY: dict[str, Any] = {
     "requestBody": {
         "required": True,
         "content": {PROTOBUF_TYPE: {"schema": {"type": "string", "format": "binary"}}},
+    }
+}
+_CALL_BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            each: {"schema": {"type": "string", "format": "binary"}}
+            for each in (PROTOBUF_TYPE, RECORDS_TYPE)
+        },
     }
 }
 _Method = Callable[[Request], Coroutine[Any, Any, Message]]
@@ -95,23 +105,49 @@ def stream_routes(
                 await call.leave()
 
         return StreamingResponse(
-            records(), media_type=RECORDS_TYPE, headers={CALL_ID_HEADER: call.call_id}
+            records(),
+            media_type=RECORDS_TYPE,
+            headers={
+                CALL_ID_HEADER: call.call_id,
+                ACCEPT_POST_HEADER: f"{PROTOBUF_TYPE}, {RECORDS_TYPE}",
+            },
         )
 
-    @router.post("/v1/streams/{call_id}", status_code=204, openapi_extra=_BODY)
+    @router.post("/v1/streams/{call_id}", status_code=204, openapi_extra=_CALL_BODY)
     async def send(call_id: str, request: Request) -> None:
-        """Send one StreamDepthRequest to an open call. Waits while the call accepts no more."""
+        """Send one StreamDepthRequest to an open call, or many as records.
+
+        The answer comes when the call has accepted them all.
+        """
         if call_id not in open_calls or open_calls[call_id].caller.name != CALLER.get().name:
             raise UnknownStream("no open call has this id; open or resume the stream")
         call = open_calls[call_id]
+        kind = request.headers["content-type"].partition(";")[0].strip().lower()
         try:
-            with calls.memory.hold_frame(0) as memory:  # many may send at once to one call
-                limit = calls.limits.max_frame_bytes + _BESIDE_IMAGES
-                message = await body(request, limit, received=memory.grow)
-                await call.put(codec.read_request(message))
+            await (
+                call.until_end(many(call, request)) if kind == RECORDS_TYPE else one(call, request)
+            )
         except DepthError as error:
             call.end(error)  # the client would wait for an answer to this message for ever
             raise
+
+    limit = calls.limits.max_frame_bytes + _BESIDE_IMAGES
+
+    async def one(call: _HttpCall, request: Request) -> None:
+        with calls.memory.hold_frame(0) as memory:  # many may send at once to one call
+            message = await body(request, limit, received=memory.grow)
+            await call.put(codec.read_request(message))
+
+    async def many(call: _HttpCall, request: Request) -> None:
+        messages = messages_of(
+            request,
+            limit=limit,
+            memory=calls.memory,
+            patience_s=patience_s,
+            min_bytes_per_s=min_bytes_per_s,
+        )
+        async for message in messages:
+            await call.put(codec.read_request(message))
 
     @router.post(
         "/v1/methods/{method}",
@@ -169,6 +205,19 @@ class _HttpCall:
         finally:
             ended.cancel()
             put.cancel()
+
+    async def until_end(self, upload: Coroutine[Any, Any, None]) -> None:
+        """Take what a long request brings, until it or the call ends."""
+        ended = asyncio.create_task(self._ended.wait())
+        taking = asyncio.create_task(upload)
+        try:
+            await asyncio.wait([ended, taking], return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in (ended, taking):
+                task.cancel()
+        await asyncio.wait([taking])
+        if not taking.cancelled():
+            taking.result()
 
     def end(self, error: DepthError) -> None:
         self._call.end(error)
