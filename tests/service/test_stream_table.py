@@ -35,6 +35,8 @@ RECTIFIER = Rectifier.of(RIG_OPENING.rig, REACH)
 class Connection:
     """An attachment that records its notices and its end."""
 
+    transport = "grpc"
+
     def __init__(self, clock: ManualClock) -> None:
         self.notices: list[Notice] = []
         self.errors: list[DepthError] = []

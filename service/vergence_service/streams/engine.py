@@ -106,6 +106,11 @@ class DepthEngine:
         return self._phase is _Phase.SERVING
 
     @property
+    def health(self) -> str:
+        """loading, serving or draining."""
+        return self._phase.value
+
+    @property
     def computed_by(self) -> str:
         """The inference engine and its instruction set."""
         return self._model.engine
@@ -294,6 +299,7 @@ class DepthEngine:
         """Count a frame that was answered with an error."""
         stream.frames_failed += 1
         stream.frames_skipped += 1
+        stream.failures[error.code] += 1
         self.metrics.frames_failed.labels(error.code).inc()
 
     def note_sent(self, stepped: SteppedFrame) -> None:
@@ -376,7 +382,7 @@ class DepthEngine:
                     self._forget(stream, Origin.RESET_NON_FINITE)
                 raise
             stream.commit(frame.frame_id, result.state, frames_skipped=skipped)
-        stream.note_answer(self._clock(), arrived_s, origin, timings.model_s)
+        stream.note_answer(self._clock(), arrived_s, origin, iterations, timings.model_s)
         if live:
             self.metrics.model_s.labels(stream.owner.name).inc(timings.model_s)
         self.metrics.frames_stepped.labels(origin.name.lower()).inc()

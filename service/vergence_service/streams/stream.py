@@ -1,12 +1,12 @@
 """A stream: the configuration and the recurrent state of one client's sequence of frames."""
 
 import asyncio
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Protocol
 
-from vergence_proto.errors import DepthError, FrameOutOfOrder
+from vergence_proto.errors import DepthError, ErrorCode, FrameOutOfOrder
 from vergence_proto.geometry import Axes
 from vergence_proto.types import Delivery, Origin, OutputFormat, StereoRig
 from vergence_service.access.principals import LOCAL, Principal
@@ -33,6 +33,11 @@ class Notice:
 
 class Attachment(Protocol):
     """The connection that uses a stream. Its methods must neither block nor raise."""
+
+    @property
+    def transport(self) -> str:
+        """Its name: grpc, http or zenoh."""
+        ...
 
     @property
     def busy(self) -> bool:
@@ -104,6 +109,8 @@ class Stream:
     # For administrators: when the last frames were stepped and how old they were then, in seconds.
     answers: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=512))
     last_origin: Origin | None = None  # of the last step
+    last_iterations: int = 0
+    failures: Counter[ErrorCode] = field(default_factory=Counter)  # frames, by reason
     model_s: float = 0.0  # time in the model, of all frames
     saver: StreamSaver | None = None  # None: no snapshots are kept
 
@@ -139,10 +146,12 @@ class Stream:
         # Frames that were dropped while this one was in the model count for the next.
         self.frames_skipped -= frames_skipped
 
-    def note_answer(self, now_s: float, arrived_s: float, origin: Origin, model_s: float) -> None:
+    def note_answer(
+        self, now_s: float, arrived_s: float, origin: Origin, iterations: int, model_s: float
+    ) -> None:
         """Record a step for administrators."""
         self.answers.append((now_s, now_s - arrived_s))
-        self.last_origin = origin
+        self.last_origin, self.last_iterations = origin, iterations
         self.model_s += model_s
 
     def forget(self, reason: Origin) -> None:

@@ -182,6 +182,7 @@ class StreamTable:
             attachment,
             self._clock(),
             owner=place.owner,
+            transport=attachment.transport if attachment else "",
         )
         self._streams[place.key] = stream
         self._metrics.streams_opened.inc()
@@ -219,14 +220,15 @@ class StreamTable:
             stream.attachment.end(
                 Superseded(f"a newer connection attached to stream {stream_id!r}")
             )
-        self._metrics.openings.labels("resumed").inc()
-        log_event(log, "stream resumed", **_about(stream))
         stream.config = config
         stream.attachment = attachment
+        stream.transport = attachment.transport
         stream.client = client  # the client may have changed its network
         stream.owner = owner  # and its token
         if stream.state is not None:
             stream.origin = Origin.RESUMED
+        self._metrics.openings.labels("resumed").inc()
+        log_event(log, "stream resumed", **_about(stream))
         self.touch(stream)
         return stream
 

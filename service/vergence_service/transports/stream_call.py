@@ -79,7 +79,7 @@ class DepthCall:
         self._write = write
         self._client = client
         self._caller = caller
-        self._transport = transport
+        self.transport = transport
         self._limits = limits
         self._clock = clock
         self._outbox = Outbox(
@@ -156,13 +156,12 @@ class DepthCall:
                 log,
                 "stream refused",
                 principal=self._caller.name,
-                transport=self._transport,
+                transport=self.transport,
                 address=self._client,
                 reason=error.code,
             )
             raise
         self._stream = stream
-        stream.transport = self._transport
         try:
             await self._write_in_time(pb.StreamDepthResponse(opened=self._opened(stream, resumed)))
             if self._error is None:

@@ -4,6 +4,7 @@ import html
 import secrets
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
 from urllib.parse import parse_qs
@@ -16,7 +17,7 @@ from vergence_proto.errors import DepthError, Unauthenticated
 from vergence_service.access.gate import Gate
 from vergence_service.access.principals import Principal, Role
 from vergence_service.streams.engine import DepthEngine
-from vergence_service.streams.report import StreamReport, reports
+from vergence_service.streams.report import ServerReport, StreamReport, reports, server_report
 from vergence_service.transports.http.errors import PROBLEM_RESPONSE, install_problems
 from vergence_service.transports.http.metrics import metrics_routes
 
@@ -28,8 +29,18 @@ _LARGEST_FORM = 4096
 # The page and the docs are files of this package: nothing is loaded from elsewhere.
 _ASSETS = {"page.js": "text/javascript", "page.css": "text/css"}
 _POLICY = {
-    "Content-Security-Policy": "default-src 'self'; frame-ancestors 'none'; form-action 'self'"
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "connect-src 'self'; img-src 'self' data:; form-action 'self'; base-uri 'none'; "
+    "frame-ancestors 'none'"
 }
+
+
+@dataclass(frozen=True, slots=True)
+class AdminState:
+    """What the page shows."""
+
+    server: ServerReport
+    streams: list[StreamReport]
 
 
 class Logins:
@@ -98,6 +109,12 @@ def make_admin_app(
     async def streams() -> list[StreamReport]:
         """List the open streams of all principals, those with the most model time first."""
         return reports(engine.streams, clock())
+
+    @router.get("/v1/admin/state")
+    async def state() -> AdminState:
+        """Get all that the page shows: the server, and its open streams."""
+        now_s = clock()
+        return AdminState(server_report(engine, now_s), reports(engine.streams, now_s))
 
     @router.delete("/v1/admin/streams/{principal}/{stream_id}", status_code=204)
     async def close(principal: str, stream_id: str, request: Request) -> None:
@@ -186,7 +203,8 @@ def _asset(name: str) -> str:
 def _page(title: str, body: str) -> HTMLResponse:
     return HTMLResponse(
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title>'
-        f'<link rel="stylesheet" href="/assets/page.css"><h1>{title}</h1>{body}</html>',
+        '<link rel="icon" href="data:,"><link rel="stylesheet" href="/assets/page.css">'
+        f"<h1>{title}</h1>{body}</html>",
         headers=_POLICY,
     )
 

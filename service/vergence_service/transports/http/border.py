@@ -31,7 +31,8 @@ _CALL_PATHS = "/v1/streams/"
 _HEADERS: Mapping[str, str] = {
     "X-Content-Type-Options": "nosniff",
     "Cross-Origin-Resource-Policy": "same-origin",
-    "Referrer-Policy": "no-referrer",
+    # With "no-referrer", a browser hides the origin of its own forms too, so no login would work.
+    "Referrer-Policy": "same-origin",
 }
 
 

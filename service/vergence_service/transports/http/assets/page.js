@@ -1,44 +1,118 @@
 "use strict";
 
 const EVERY_MS = 1000;
+const MIB = 1 << 20;
+let before = null; // the last answer, for rates
 
-function row(stream) {
-  const age = stream.age_p50_s === null ? "" : (1000 * stream.age_p50_s).toFixed(0);
-  const cells = [
-    `${stream.principal}/${stream.stream_id}`,
-    `${stream.width}x${stream.height}`,
-    stream.transport + (stream.address ? ` ${stream.address}` : ""),
-    stream.rate_hz.toFixed(1),
-    age,
-    stream.model_s.toFixed(1),
-    stream.last_origin ?? "",
-    stream.warm_steps,
-    stream.frames_stepped,
-    stream.frames_dropped,
-    stream.frames_failed,
-    stream.idle_s.toFixed(0),
-  ];
-  const line = document.createElement("tr");
-  line.className = stream.attached ? "" : "away";
-  for (const cell of cells) {
-    line.insertCell().textContent = cell; // never as HTML: clients choose the ids
-  }
-  return line;
+// Clients choose ids, so nothing is ever set as HTML.
+function fill(id, rows) {
+  const lines = rows.map(({ cells, away }) => {
+    const line = document.createElement("tr");
+    line.className = away ? "away" : "";
+    for (const cell of cells) line.insertCell().textContent = cell;
+    return line;
+  });
+  document.getElementById(id).replaceChildren(...lines);
+}
+
+function listed(counts) {
+  return Object.entries(counts)
+    .filter(([, count]) => count > 0)
+    .map(([why, count]) => `${count} ${why.toLowerCase().replaceAll("_", " ")}`)
+    .join(", ");
+}
+
+function streamRow(stream) {
+  const answered = Math.max(stream.frames_stepped, 1);
+  return {
+    away: !stream.attached,
+    cells: [
+      stream.principal,
+      stream.stream_id,
+      `${stream.width}x${stream.height}`,
+      stream.transport + (stream.address ? ` ${stream.address}` : ""),
+      stream.rate_hz.toFixed(1),
+      stream.age_p50_s === null ? "" : (1000 * stream.age_p50_s).toFixed(0),
+      ((1000 * stream.model_s) / answered).toFixed(1),
+      stream.last_iterations || "",
+      (stream.last_origin ?? "").replaceAll("_", " "),
+      stream.warm_steps,
+      stream.frames_stepped,
+      listed({ "displaced by a newer frame": stream.frames_dropped, ...stream.failures }),
+      stream.idle_s.toFixed(0),
+    ],
+  };
+}
+
+function principalRow(principal, elapsed_s, lanes) {
+  const known = before?.server.principals.find((each) => each.principal === principal.principal);
+  const used_s = principal.model_s - (known ? known.model_s : principal.model_s);
+  return {
+    cells: [
+      principal.principal,
+      principal.streams,
+      elapsed_s ? `${((100 * used_s) / elapsed_s / lanes).toFixed(0)} %` : "",
+      principal.model_s.toFixed(1),
+      principal.megapixels_per_s.toFixed(1),
+      (principal.memory_bytes / MIB).toFixed(1),
+    ],
+  };
+}
+
+function facts(server, streams, elapsed_s) {
+  const total = (each) => each.server.principals.reduce((sum, one) => sum + one.model_s, 0);
+  const busy = elapsed_s ? (total({ server }) - total(before)) / elapsed_s / server.lanes : 0;
+  const memory = Object.values(server.memory_bytes).reduce((sum, each) => sum + each, 0);
+  return {
+    model: `${server.model} ${server.weights}, ${server.engine} on ${server.provider}`,
+    version: server.version,
+    "open streams": streams.length,
+    "answers per second": streams.reduce((sum, each) => sum + each.rate_hz, 0).toFixed(1),
+    "model busy": elapsed_s ? `${(100 * busy).toFixed(0)} % of ${server.lanes} lanes` : "",
+    "streams that wait for the model": server.turns_waiting,
+    memory: `${(memory / MIB).toFixed(0)} of ${(server.memory_limit_bytes / MIB).toFixed(0)} MiB`,
+    sequences: listed(server.sequences) || "none",
+    "open calls": server.calls_open,
+  };
+}
+
+function show(answer) {
+  const { server, streams } = answer;
+  const elapsed_s = before ? server.at_s - before.server.at_s : 0;
+  const health = document.getElementById("health");
+  health.textContent = server.health;
+  health.className = server.health;
+  const terms = Object.entries(facts(server, streams, elapsed_s)).map(([name, value]) => {
+    const item = document.createElement("div");
+    item.appendChild(document.createElement("dt")).textContent = name;
+    item.appendChild(document.createElement("dd")).textContent = value;
+    return item;
+  });
+  document.getElementById("facts").replaceChildren(...terms);
+  fill("streams", streams.map(streamRow));
+  fill(
+    "principals",
+    server.principals.map((each) => principalRow(each, elapsed_s, server.lanes)),
+  );
+  const refusals = Object.entries(server.refusals).flatMap(([what, counts]) =>
+    Object.entries(counts).map(([why, count]) => ({ cells: [what, why, count] })),
+  );
+  fill("refusals", refusals);
+  before = answer;
 }
 
 async function refresh() {
-  const summary = document.getElementById("summary");
   try {
-    const answer = await fetch("/v1/admin/streams");
+    const answer = await fetch("/v1/admin/state");
     if (answer.status === 401) {
       location.assign("/login");
       return;
     }
-    const streams = await answer.json();
-    document.getElementById("streams").replaceChildren(...streams.map(row));
-    summary.textContent = streams.length === 1 ? "1 open stream" : `${streams.length} open streams`;
+    show(await answer.json());
   } catch {
-    summary.textContent = "the server does not answer";
+    const health = document.getElementById("health");
+    health.textContent = "the server does not answer";
+    health.className = "lost";
   }
   setTimeout(refresh, EVERY_MS);
 }
