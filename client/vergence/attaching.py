@@ -29,6 +29,9 @@ _GONE = (UnknownStream, StreamExpired, ModelChanged)
 _NO_ROOM = (Quota, StreamLimit, StateMemory)
 _LAST_ATTEMPT_S = 0.2  # with less time left, waiting for room ends
 _ANSWER_TIMEOUT_S = 5.0  # from the opening to its answer, on a connection that is up
+# The same for the first attempt to resume. A load balancer may not know yet that the stream's
+# server hangs, and leads the next attempt to another one.
+_FIRST_RESUME_S = 1.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,10 +120,12 @@ class StreamAttacher:
     async def _attached(self, call: Call | None) -> Call:
         waits = pauses()
         refused_s: float | None = None  # since this time the server has had no room
+        patience_s = _ANSWER_TIMEOUT_S if self.opened is None else _FIRST_RESUME_S
         while True:
             try:
                 call = call or await self.dial()
-                await self._attach(call)
+                answer_within_s, patience_s = patience_s, _ANSWER_TIMEOUT_S
+                await self._attach(call, within_s=answer_within_s)
                 return call
             except ClientClosed:
                 raise
@@ -146,9 +151,9 @@ class StreamAttacher:
             call = None
             await asyncio.sleep(wait_s)
 
-    async def _attach(self, call: Call) -> None:
+    async def _attach(self, call: Call, *, within_s: float) -> None:
         try:
-            async with asyncio.timeout(_ANSWER_TIMEOUT_S):
+            async with asyncio.timeout(within_s):
                 await call.send(pb.StreamDepthRequest(open=self._opening).SerializeToString())
                 response = await call.receive()
             if response is None or not response.HasField("opened"):
@@ -156,7 +161,7 @@ class StreamAttacher:
         except TimeoutError:
             self.unsure = True
             await call.close()
-            raise ConnectionLost(f"the server did not answer in {_ANSWER_TIMEOUT_S:g} s") from None
+            raise ConnectionLost(f"the server did not answer in {within_s:g} s") from None
         except BaseException:
             await call.close()
             raise
