@@ -13,7 +13,8 @@ from tests.support.http import ZIP, ended, http_server, reason_of, submit
 from tests.support.models import RecallModel
 from tests.support.polling import eventually_true
 from tests.support.sequences import make_frames, sequence_files, zip_bytes
-from vergence_service.jobs.webhooks import signature_of
+from vergence_proto.errors import BadShape
+from vergence_service.jobs.webhooks import WebhookHosts, signature_of
 
 ARCHIVE = zip_bytes(sequence_files(make_frames(2)))
 
@@ -108,11 +109,16 @@ async def test_who_is_gone_hears_no_more() -> None:
         (["127.0.0.1"], "https://127.0.0.1/a\r\nX: y", "https://HOST/PATH"),
     ],
 )
-async def test_a_webhook_that_is_not_allowed_is_a_problem(
+async def test_a_webhook_goes_only_to_an_address_that_is_allowed(
     hosts: list[str], webhook: str, why: str
 ) -> None:
-    async with http_server(RecallModel(), batch__webhook_hosts=hosts) as client:
-        query = {"webhook": webhook}
+    with pytest.raises(BadShape, match=why):
+        await WebhookHosts(hosts).target(webhook)
+
+
+async def test_a_webhook_to_a_private_address_is_a_problem_of_the_submission() -> None:
+    async with http_server(RecallModel(), batch__webhook_hosts=["*"]) as client:
+        query = {"webhook": "https://169.254.169.254/latest"}
         answer = await client.post("/v1/sequences", params=query, content=ARCHIVE, headers=ZIP)
         assert reason_of(answer) == "BAD_SHAPE"
-        assert why in answer.json()["detail"]
+        assert "private address" in answer.json()["detail"]

@@ -131,6 +131,7 @@ async def serving_http(
                         disk_bytes=batch.disk_mib * _MIB,
                         principal_bytes=settings.limits.sequences_mib * _MIB,
                         webhook_hosts=batch.webhook_hosts,
+                        inputs=batch.inputs,
                     ),
                 )
             )

@@ -64,6 +64,7 @@ def manifest_of(status: JobStatus, folder: Path) -> dict[str, Any]:
         },
         "source": job.source,
         "upload_sha256": job.upload_sha256,
+        "input": job.input,
         "rig": None if rig is None else dataclasses.asdict(rig),
         "left_from_rectified": None if rotation is None else rotation.rotation.tolist(),
         "axes": "OPENCV",

@@ -44,6 +44,7 @@ class Job:
     name: str = ""  # the client's own name for it
     labels: Mapping[str, str] = field(default_factory=dict)  # the client's own
     priority: JobPriority = JobPriority.NORMAL
+    input: str = ""  # file:NAME/PATH of a folder of the server, in place of an upload
     keep_input: bool = False  # until the result expires, for another run
     webhook: str = ""  # address that hears of the end
     webhook_result: str = ""  # empty: not sent yet

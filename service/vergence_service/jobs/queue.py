@@ -20,6 +20,7 @@ from vergence_proto.errors import (
 )
 from vergence_proto.jobs import JobOutput, JobPriority, OnError, Quality
 from vergence_service.access.principals import LOCAL, Principal
+from vergence_service.jobs.folder_inputs import FolderInputs
 from vergence_service.jobs.forecast import forecast
 from vergence_service.jobs.job import Job, JobOptions
 from vergence_service.jobs.kept_uploads import KeptUploads
@@ -54,6 +55,7 @@ class QueueLimits:
     disk_bytes: int  # disk space
     principal_bytes: int  # the same of one principal that has shown a credential
     webhook_hosts: Sequence[str] = ()  # hosts that webhooks may go to
+    inputs: Sequence[str] = ()  # NAME=PATH of folders that jobs may read
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,6 +66,7 @@ class JobOrder:
     options: JobOptions = field(default_factory=JobOptions)
     upload: str = ""  # id of the upload that it came in, if that arrived in parts
     priority: JobPriority = JobPriority.NORMAL
+    input: str = ""  # file:NAME/PATH, in place of an upload
     keep_input: bool = False  # for another run
     webhook: str = ""  # address that hears of the end
     name: str = ""
@@ -100,6 +103,7 @@ class JobQueue:
         self._worker = JobWorker(
             engine, self.jobs, checkpoint_s=limits.checkpoint_s, uploads=self.uploads
         )
+        self.inputs = FolderInputs(limits.inputs)
         self._webhook_hosts = WebhookHosts(limits.webhook_hosts)
         self._webhooks = WebhookSender(
             self.jobs, self._webhook_hosts, secret_file=store.directory / "webhook_secret"
@@ -227,6 +231,7 @@ class JobQueue:
             name=order.name,
             labels=order.labels,
             priority=order.priority,
+            input=order.input,
             keep_input=order.keep_input,
             webhook=order.webhook,
             key=order.key,
@@ -299,7 +304,10 @@ class JobQueue:
                 "with keep_input=true"
             )
         with self.jobs.reading(job.job_id):
-            await self.threads.finish(linking(kept, folder / "input"))
+            if job.input:
+                await self.threads.run((folder / "input").symlink_to, kept.readlink())
+            else:
+                await self.threads.finish(linking(kept, folder / "input"))
 
     async def _delete(self, job_id: str) -> None:
         await self._worker.cancel(job_id)

@@ -188,7 +188,10 @@ class JobStore:
 
 
 def remove_folder(folder: Path) -> None:
-    """Remove a folder with its content, if it exists."""
+    """Remove a folder with its content, or a link to one, if it exists."""
+    if folder.is_symlink():
+        folder.unlink(missing_ok=True)
+        return
     shutil.rmtree(folder, ignore_errors=True)
 
 

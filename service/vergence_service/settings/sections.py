@@ -1,7 +1,7 @@
 """The sections of the settings: every key, with its default and its meaning."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
 
@@ -269,6 +269,9 @@ class BatchSettings(Section):
     )
     idle_s: PositiveFloat = Field(
         default=30.0, description="abort an upload that sends nothing for this long"
+    )
+    inputs: list[Annotated[str, Field(pattern=r"^[\w.-]+=.+$")]] = Field(
+        default=[], description="folders that jobs may read without an upload, as NAME=PATH"
     )
     webhook_hosts: list[str] = Field(
         default=[], description='hosts that webhooks may go to; "*": any with a public address'

@@ -38,6 +38,7 @@ _EXAMPLE: dict[str, JsonValue] = {
     "iterations": 0,
     "quality": "fast",
     "priority": "normal",
+    "input": "",
     "keep_input": False,
     "webhook": "",
     "webhook_result": None,
@@ -124,6 +125,12 @@ class SubmitQuery(OptionsQuery):
         max_length=64,
         description="id of a complete upload of /v1/uploads, in place of a body",
     )
+    input: str = Field(
+        default="",
+        max_length=1000,
+        description="file:NAME/PATH, a folder that the server's operator has named, in place of a "
+        "body",
+    )
     model: str | None = Field(default=None, description="refuse unless the server runs this model")
     wait: bool = Field(default=False, description="answer with the result, when the job is done")
     format: ResultFormat = Field(
@@ -175,6 +182,7 @@ class SequenceJob(BaseModel):
     iterations: int
     quality: Quality
     priority: JobPriority
+    input: str = Field(description="folder of the server, in place of an upload")
     keep_input: bool
     webhook: str
     webhook_result: str | None = Field(
@@ -217,6 +225,7 @@ class SequenceJob(BaseModel):
             iterations=job.options.iterations,
             quality=job.options.quality,
             priority=job.priority,
+            input=job.input,
             keep_input=job.keep_input,
             webhook=job.webhook,
             webhook_result=job.webhook_result or None,

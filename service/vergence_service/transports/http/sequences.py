@@ -116,6 +116,7 @@ def sequence_routes(
             source=query.source,
             options=query.options(),
             upload=query.upload or "",
+            input=query.input,
             priority=query.priority,
             keep_input=query.keep_input,
             webhook=query.webhook,
@@ -133,7 +134,11 @@ def sequence_routes(
                 async with queue.upload_folder(
                     client, upload_bytes=upload_bytes, owner=caller
                 ) as folder:
-                    if query.upload is None:
+                    if query.input:
+                        found = await threads.run(queue.inputs.find, query.input)
+                        await threads.run((folder / "input").symlink_to, found)
+                        digest = ""
+                    elif query.upload is None:
                         digest = await receive_sequence(request, folder, limits, threads)
                     else:
                         kept = await threads.run(queue.uploads.get, query.upload, caller)
@@ -211,6 +216,7 @@ def sequence_routes(
         before = jobs.get(job_id)
         order = JobOrder(
             source=before.source,
+            input=before.input,
             options=query.options(before.options),
             priority=query.priority,
             keep_input=query.keep_input,
