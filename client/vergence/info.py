@@ -43,6 +43,9 @@ class ServerInfo:
     """The largest message in bytes that the server accepts."""
     max_pixels: int
     """The largest number of pixels of one image."""
+    capabilities: frozenset[str] = frozenset()
+    """What the server can do that one of version 0.1 could not; see
+    :class:`vergence_proto.capabilities.Capability`."""
 
 
 @dataclass(frozen=True, slots=True)

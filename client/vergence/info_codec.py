@@ -28,6 +28,7 @@ def server_info_from_proto(message: pb.GetServerInfoResponse) -> ServerInfo:
         streams_max=message.streams_max,
         max_message_bytes=message.max_message_bytes,
         max_pixels=message.max_pixels,
+        capabilities=frozenset(message.capabilities),
     )
 
 

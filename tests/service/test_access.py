@@ -32,6 +32,7 @@ from vergence import (
     Unauthenticated,
     UnknownStream,
 )
+from vergence_proto.capabilities import Capability
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.access.principals import LOCAL
 from vergence_service.app.security import check_exposure
@@ -437,3 +438,25 @@ async def test_the_environment_and_the_command_make_and_show_tokens(
     async with httpx.AsyncClient() as plain:
         answer = await plain.get(f"http://{guarded.server.http_address}/v1/sequences")
     assert answer.status_code == 401
+
+
+async def test_a_page_of_a_named_origin_may_call() -> None:
+    page, body = "https://app.example", pb.GetServerInfoRequest().SerializeToString()
+    url, foreign = "/v1/methods/GetServerInfo", {"Sec-Fetch-Site": "cross-site"}
+    async with (
+        running_server(RecallModel(), security__origins=[page]) as server,
+        http_to(server) as http,
+    ):
+        preflight = {"Origin": page, "Access-Control-Request-Method": "POST", **foreign}
+        asked = await http.options(url, headers=preflight)
+        assert (asked.status_code, asked.headers["access-control-allow-origin"]) == (204, page)
+        assert "Authorization" in asked.headers["access-control-allow-headers"]
+        headers = {**PROTOBUF, **foreign}
+        answer = await http.post(url, content=body, headers={**headers, "Origin": page})
+        assert (answer.status_code, answer.headers["access-control-allow-origin"]) == (200, page)
+        info = pb.GetServerInfoResponse.FromString(answer.content)
+        assert set(info.capabilities) == set(Capability)
+        for other in (f"{page}.evil.example", "http://app.example", "null"):
+            refused = await http.post(url, content=body, headers={**headers, "Origin": other})
+            assert refused.status_code == 403
+            assert "access-control-allow-origin" not in refused.headers

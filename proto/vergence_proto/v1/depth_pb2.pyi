@@ -476,7 +476,7 @@ class GetServerInfoRequest(_message.Message):
     def __init__(self) -> None: ...
 
 class GetServerInfoResponse(_message.Message):
-    __slots__ = ("version", "model", "provider", "streams_open", "streams_max", "max_message_bytes", "max_pixels", "engine", "instruction_set")
+    __slots__ = ("version", "model", "provider", "streams_open", "streams_max", "max_message_bytes", "max_pixels", "engine", "instruction_set", "capabilities")
     VERSION_FIELD_NUMBER: _ClassVar[int]
     MODEL_FIELD_NUMBER: _ClassVar[int]
     PROVIDER_FIELD_NUMBER: _ClassVar[int]
@@ -486,6 +486,7 @@ class GetServerInfoResponse(_message.Message):
     MAX_PIXELS_FIELD_NUMBER: _ClassVar[int]
     ENGINE_FIELD_NUMBER: _ClassVar[int]
     INSTRUCTION_SET_FIELD_NUMBER: _ClassVar[int]
+    CAPABILITIES_FIELD_NUMBER: _ClassVar[int]
     version: str
     model: ModelInfo
     provider: str
@@ -495,7 +496,8 @@ class GetServerInfoResponse(_message.Message):
     max_pixels: int
     engine: str
     instruction_set: str
-    def __init__(self, version: _Optional[str] = ..., model: _Optional[_Union[ModelInfo, _Mapping[str, _Any]]] = ..., provider: _Optional[str] = ..., streams_open: _Optional[int] = ..., streams_max: _Optional[int] = ..., max_message_bytes: _Optional[int] = ..., max_pixels: _Optional[int] = ..., engine: _Optional[str] = ..., instruction_set: _Optional[str] = ...) -> None: ...
+    capabilities: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, version: _Optional[str] = ..., model: _Optional[_Union[ModelInfo, _Mapping[str, _Any]]] = ..., provider: _Optional[str] = ..., streams_open: _Optional[int] = ..., streams_max: _Optional[int] = ..., max_message_bytes: _Optional[int] = ..., max_pixels: _Optional[int] = ..., engine: _Optional[str] = ..., instruction_set: _Optional[str] = ..., capabilities: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class GetStreamRequest(_message.Message):
     __slots__ = ("stream_id", "resume_token")

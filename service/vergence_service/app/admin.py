@@ -6,6 +6,7 @@ import logging
 import socket
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from typing import Any
 
 from prometheus_client import CollectorRegistry
@@ -55,7 +56,7 @@ async def serving_admin(
             secure=certificate is not None,
         )
         server = HttpServer(
-            Border(app, gate=gate, hosts=host_names(settings), logins=logins),
+            Border(app, gate=gate, hosts=replace(host_names(settings), origins=()), logins=logins),
             None,
             listening=listening,
             limits=ConnectionLimits(

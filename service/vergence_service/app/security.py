@@ -75,7 +75,8 @@ def host_names(settings: Settings) -> HostNames:
     """Return the names under which the server may be called over HTTP."""
     chosen = settings.security
     names = tuple(name.lower() for name in chosen.hosts)
-    return HostNames(names=names, certified=chosen.tls_cert is not None)
+    origins = tuple(origin.lower().rstrip("/") for origin in chosen.origins)
+    return HostNames(names=names, origins=origins, certified=chosen.tls_cert is not None)
 
 
 async def keep_current(gate: Gate, certificate: Certificate | None, engine: DepthEngine) -> None:

@@ -75,6 +75,10 @@ class SecuritySettings(Section):
     hosts: tuple[str, ...] = Field(
         default=(), description='names of this server for HTTP without TLS; "*" allows any'
     )
+    origins: tuple[str, ...] = Field(
+        default=(),
+        description="web pages that may call the HTTP API, as https://app.example (CORS)",
+    )
     trusted_proxies: tuple[str, ...] = Field(
         default=(), description="addresses whose X-Forwarded-For is believed"
     )

@@ -4,6 +4,7 @@ import hmac
 from importlib.metadata import version
 
 from vergence_proto import codec
+from vergence_proto.capabilities import Capability
 from vergence_proto.errors import UnknownStream
 from vergence_proto.instruction_set import instruction_set
 from vergence_proto.model_io import ModelCard
@@ -42,6 +43,7 @@ class UnaryMethods:
             max_pixels=self._engine.max_pixels,
             engine=self._computed_by,
             instruction_set=instruction_set(),
+            capabilities=list(Capability),
         )
 
     async def stream(self, request: pb.GetStreamRequest, caller: Principal) -> pb.GetStreamResponse:

@@ -34,6 +34,14 @@ _HEADERS: Mapping[str, str] = {
     # With "no-referrer", a browser hides the origin of its own forms too, so no login would work.
     "Referrer-Policy": "same-origin",
 }
+_FOR_PAGES: Mapping[str, str] = {
+    "Access-Control-Allow-Methods": "GET, POST, PUT, PATCH, DELETE, HEAD",
+    "Access-Control-Allow-Headers": "*, Authorization",
+    "Access-Control-Expose-Headers": "*",
+    "Access-Control-Max-Age": "600",
+    "Cross-Origin-Resource-Policy": "cross-origin",
+    "Vary": "Origin",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,6 +52,7 @@ class HostNames:
     """
 
     names: Sequence[str] = ()  # besides localhost; "*": any
+    origins: Sequence[str] = ()  # of pages that may call
     certified: bool = False  # TLS proves the name: a browser refuses a foreign one
 
     def check_host(self, host: str) -> None:
@@ -56,9 +65,15 @@ class HostNames:
             "add the name to the server's setting security.hosts"
         )
 
+    def invites(self, headers: Headers) -> bool:
+        """Return True if a page of one of the origins sent the request."""
+        return headers.get("origin", "").lower() in self.origins
+
     def check_page(self, headers: Headers) -> None:
         """Raise Forbidden if a page of another origin sent the request."""
         origin = headers.get("origin")
+        if self.invites(headers):
+            return
         if origin is not None:
             parts = urlsplit(origin)
             same = parts.netloc.lower() == headers.get("host", "").lower()
@@ -85,16 +100,24 @@ class Border:
             await self._app(scope, receive, send)
             return
 
+        asked = Headers(scope=scope)
+        invited = self._hosts.invites(asked)
+        preflight = invited and "access-control-request-method" in asked
+
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
+                if invited:
+                    headers.update({**_FOR_PAGES, "Access-Control-Allow-Origin": asked["origin"]})
                 for name, value in _HEADERS.items():
                     headers.setdefault(name, value)
             await send(message)
 
         with ExitStack() as stack:
             try:
-                if scope["path"] not in _OPEN_PATHS:
+                if preflight:  # a browser asks without the page's credential
+                    self._hosts.check_host(asked.get("host", ""))
+                elif scope["path"] not in _OPEN_PATHS:
                     self._check(scope, stack)
             except DepthError as error:
                 answer: Response = refusal_of(error)
@@ -102,7 +125,8 @@ class Border:
                     answer = RedirectResponse(LOGIN, status_code=303)
                 await answer(scope, receive, send_with_headers)
             else:
-                await self._app(scope, receive, send_with_headers)
+                app = Response(status_code=204) if preflight else self._app
+                await app(scope, receive, send_with_headers)
 
     def _check(self, scope: Scope, request: ExitStack) -> None:
         headers = Headers(scope=scope)
