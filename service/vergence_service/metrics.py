@@ -42,7 +42,7 @@ class Metrics:
         )
         self.model_s = Counter(
             "vergence_model_seconds",
-            "Time in the model, of live streams",
+            "Time in the model",
             ["principal"],
             registry=registry,
         )

@@ -11,6 +11,9 @@ and upload sequences, over gRPC and HTTP. Then all of them leave. The benchmark 
 - ``growth_mib`` is small: the resident memory at the end over that at half time;
 - the server logged no traceback, and ends on SIGTERM with code 0.
 
+``--secure``: the server has TLS and tokens, its clients belong to three principals, and its
+certificate is replaced every few seconds.
+
 ``--control`` runs a server that leaks a little with each stream. It must fail.
 """
 
@@ -20,6 +23,7 @@ import json
 import os
 import re
 import signal
+import ssl
 import sys
 import tempfile
 import time
@@ -32,11 +36,17 @@ import httpx
 
 from vergence_proto.instruction_set import instruction_set
 
+sys.path.insert(0, str(Path(__file__).parents[2]))  # for tests.support
+
+from tests.support.certificates import Authority
+from tests.support.tokens import TokenFile
+
 REPOSITORY = Path(__file__).parents[2]
 CLIENTS = 6
 WARM_UP_S = 15.0
 SETTLE_S = 60.0
 SAMPLES = 40
+RENEW_S = 15.0
 MOST_GROWTH_MIB = 24.0
 # Short times, so that each of them ends many clients in some minutes.
 SETTINGS = {
@@ -63,12 +73,44 @@ class Sample:
     rss_mib: float
 
 
+class Secrets:
+    """The certificate and the tokens of a server, and of its clients."""
+
+    def __init__(self, folder: Path) -> None:
+        self._authority = Authority(folder)
+        self._issued = self._authority.issue("server")
+        self._tokens = TokenFile(folder / "tokens.toml", "ana", "ben", "eve", admins=("root",))
+
+    @property
+    def flags(self) -> list[str]:
+        return [
+            *("--tls-cert", str(self._issued.cert), "--tls-key", str(self._issued.key)),
+            *("--tokens", str(self._tokens.path)),
+        ]
+
+    @property
+    def of_clients(self) -> dict[str, str]:
+        tokens = [self._tokens.tokens[name] for name in ("ana", "ben", "eve")]
+        return {"VERGENCE_CA": str(self._authority.ca), "SOAK_TOKENS": ",".join(tokens)}
+
+    def of_the_administrator(self) -> dict[str, Any]:
+        trusted = ssl.create_default_context(cafile=str(self._authority.ca))
+        return {"verify": trusted, "headers": self._tokens.shown("root")}
+
+    async def renew(self) -> None:
+        """Replace the certificate, again and again."""
+        while True:
+            await asyncio.sleep(RENEW_S)
+            await asyncio.to_thread(self._authority.issue, "server")
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Server:
     process: asyncio.subprocess.Process
     grpc_address: str
     http_address: str
     admin_address: str
+    secrets: "Secrets | None"
 
     async def sample(self) -> Sample:
         about = Path("/proc") / str(self.process.pid)
@@ -83,15 +125,20 @@ class Server:
         )
 
     async def metrics(self) -> dict[str, float]:
-        async with httpx.AsyncClient(timeout=60) as http:
-            text = (await http.get(f"http://{self.admin_address}/metrics")).text
+        scheme, options = "http", {}
+        if self.secrets is not None:
+            scheme, options = "https", self.secrets.of_the_administrator()
+        async with httpx.AsyncClient(timeout=60, **options) as http:
+            text = (await http.get(f"{scheme}://{self.admin_address}/metrics")).text
         lines = (line.rpartition(" ") for line in text.splitlines() if not line.startswith("#"))
         return {name: float(value) for name, _, value in lines}
 
 
-async def started(folder: Path, *, leaky: bool) -> Server:
+async def started(folder: Path, *, leaky: bool, secure: bool) -> Server:
+    secrets = Secrets(folder) if secure else None
     module = ["tests.support.leaky_server"] if leaky else ["vergence_service"]
     flags = [] if leaky else ["--grpc-port", "0", "--http-port", "0"]
+    flags += secrets.flags if secrets else []
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", *module, *flags),
         cwd=REPOSITORY,
@@ -110,13 +157,13 @@ async def started(folder: Path, *, leaky: bool) -> Server:
     assert found, f"the server did not start: {(folder / 'log').read_text()[-2000:]}"
     ready = (await process.stdout.readline()).decode()  # every graph is loaded
     admin_address = ready.strip().rpartition("admin=")[2]
-    return Server(process, found[1], found[2], admin_address)
+    return Server(process, found[1], found[2], admin_address, secrets)
 
 
-async def soak(minutes: float, seed: int, *, leaky: bool) -> dict[str, Any]:
+async def soak(minutes: float, seed: int, *, leaky: bool, secure: bool) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        server = await started(folder, leaky=leaky)
+        server = await started(folder, leaky=leaky, secure=secure)
         try:
             figures = await measured(server, minutes, seed)
         finally:
@@ -139,11 +186,14 @@ async def measured(server: Server, minutes: float, seed: int) -> dict[str, Any]:
             await asyncio.sleep(60 * minutes / SAMPLES)
             samples.append(await server.sample())
 
-    watching = asyncio.create_task(watch())
+    beside = [asyncio.create_task(watch())]
+    if server.secrets is not None:
+        beside.append(asyncio.create_task(server.secrets.renew()))
     opened_before = (await server.metrics())["vergence_streams_opened_total"]
     clients = await clients_of(server, seed=seed, seconds=60 * minutes)
-    watching.cancel()
-    await asyncio.wait([watching])
+    for task in beside:
+        task.cancel()
+    await asyncio.wait(beside)
     after = await settled(server, before)
     counted = await server.metrics()
     fifth = max(len(samples) // 5, 1)
@@ -174,6 +224,7 @@ async def clients_of(server: Server, *, seed: int, seconds: float) -> dict[str, 
         *(sys.executable, "-m", "tests.support.soak_clients", *addresses),
         *map(str, (seed, seconds, CLIENTS)),
         cwd=REPOSITORY,
+        env={**os.environ, **(server.secrets.of_clients if server.secrets else {})},
         stdout=asyncio.subprocess.PIPE,
     )
     out, _ = await process.communicate()
@@ -224,10 +275,11 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--json", type=Path, help="write the figures there")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--secure", action="store_true", help="with TLS and tokens")
     parser.add_argument("--control", action="store_true", help="serve with leaks: it must fail")
     args = parser.parse_args()
-    figures = asyncio.run(soak(args.minutes, args.seed, leaky=args.control))
-    figures = {"isa": instruction_set(), "control": args.control, **figures}
+    figures = asyncio.run(soak(args.minutes, args.seed, leaky=args.control, secure=args.secure))
+    figures = {"isa": instruction_set(), "control": args.control, "secure": args.secure, **figures}
     faults = faults_of(figures)
     figures["faults"] = faults
     for name, value in figures.items():

@@ -203,6 +203,19 @@ async def test_no_stream_is_overtaken_by_another(lanes: int) -> None:
     assert [since_s for since_s, _ in sorted(taken, key=itemgetter(1))] == sorted(dict(taken))
 
 
+async def test_steps_that_are_not_live_are_shared_out_by_owner() -> None:
+    done: list[str] = []
+
+    async def keep_stepping(owner: str) -> None:
+        while len(done) < 60:
+            await batcher.step(make_step(2), owner=owner)
+            done.append(owner)
+
+    async with make_batcher(RecallModel(), max_batch=1, clock=TickingClock()) as batcher:
+        await asyncio.gather(*(keep_stepping(owner) for owner in (*["ana"] * 9, "ben")))
+    assert 25 <= done[:60].count("ben") <= 35
+
+
 @pytest.mark.parametrize("bad", [RAISES, NOT_FINITE])
 async def test_a_failure_in_one_lane_does_not_reach_the_other(bad: int) -> None:
     model = RecallModel(max_concurrent_steps=2)

@@ -1,5 +1,6 @@
 """What one principal may hold: memory, work, requests and disk. Another one is not affected."""
 
+import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -10,7 +11,7 @@ import grpc
 import pytest
 
 from tests.support.frames import RIG, frame_message, make_frame, open_message
-from tests.support.http import ZIP, reason_of, submit
+from tests.support.http import ZIP, ended, reason_of, submit
 from tests.support.models import RecallModel
 from tests.support.sequences import make_frames, sequence_files, zip_bytes
 from tests.support.server import RawCall, running_server
@@ -24,10 +25,12 @@ LARGE = StereoRig.from_rectified(replace(RIG, width=192, height=160))  # needs m
 
 
 @asynccontextmanager
-async def guarded(tmp_path: Path, **settings: Any) -> AsyncIterator[tuple[Running, TokenFile]]:
+async def guarded(
+    tmp_path: Path, model: RecallModel | None = None, **settings: Any
+) -> AsyncIterator[tuple[Running, TokenFile]]:
     file = TokenFile(tmp_path / "tokens.toml", "ana", "ben")
     async with running_server(
-        RecallModel(),
+        model or RecallModel(),
         security__tokens=file.path,
         batch__directory=tmp_path / "jobs",
         **settings,
@@ -113,6 +116,25 @@ async def test_the_results_of_one_principal_leave_disk_to_others(tmp_path: Path)
         for job_id in kept:
             await ana.delete(f"/v1/sequences/{job_id}")
         await submit(ana, archive)
+
+
+async def test_the_jobs_of_principals_run_in_turn(tmp_path: Path) -> None:
+    archive, model = zip_bytes(sequence_files(make_frames(2))), RecallModel()
+    async with (
+        guarded(tmp_path, model) as (server, file),
+        http_as(server, file.shown("ana")) as ana,
+        http_as(server, file.shown("ben")) as ben,
+    ):
+        with model.busy():
+            hers = [await submit(ana, archive) for _ in range(3)]
+            await asyncio.to_thread(model.wait_until_entered)
+            his = await submit(ben, archive)
+            ahead = [
+                (await who.get(f"/v1/sequences/{job['id']}")).json()["ahead"]
+                for who, job in ((ana, hers[1]), (ana, hers[2]), (ben, his))
+            ]
+        assert ahead == [2, 3, 1]
+        assert (await ended(ben, his["id"]))["state"] == "done"
 
 
 async def end(call: RawCall) -> None:

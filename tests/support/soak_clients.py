@@ -4,6 +4,9 @@
 
 - ``GRPC HTTP SEED SECONDS COUNT``: so many clients, for so long; prints what they did as JSON.
 - ``GRPC``: one client that streams until it is killed.
+
+If the server has TLS, ``VERGENCE_CA`` names its authority, and ``SOAK_TOKENS`` has tokens of
+several principals, with commas between them.
 """
 
 import asyncio
@@ -12,12 +15,14 @@ import json
 import os
 import random
 import signal
+import ssl
 import sys
 import time
 from collections import Counter
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -44,6 +49,10 @@ _POST = b"POST /v1/sequences HTTP/1.1\r\nHost: [::1]\r\nContent-Length: 100000\r
 _IN_TIME = (grpc.aio.AioRpcError, asyncio.InvalidStateError, TimeoutError, OSError, DepthError)
 
 
+_CA = os.environ.get("VERGENCE_CA")
+_TOKENS = os.environ.get("SOAK_TOKENS", "").split(",")
+
+
 @dataclass(eq=False)
 class Clients:
     """Random clients of one server. ``seen`` counts what they did and how it went."""
@@ -51,6 +60,7 @@ class Clients:
     grpc_address: str
     http_address: str
     rng: random.Random
+    token: str
     archive: bytes = field(default_factory=lambda: zip_bytes(sequence_files(make_frames(4))))
     seen: Counter[str] = field(default_factory=Counter)
     opened: int = 0
@@ -81,7 +91,7 @@ class Clients:
                 self.seen[f"{kind.__name__}: {_name_of(error)}"] += 1
 
     async def opened_call(self, channel: grpc.aio.Channel, **opening: Any) -> tuple[Any, Any]:
-        call = depth_pb2_grpc.DepthServiceStub(channel).StreamDepth()
+        call = depth_pb2_grpc.DepthServiceStub(channel).StreamDepth(metadata=self.metadata())
         await call.write(open_message(every=self.rng.random() < 0.5, **opening))
         answer = await asyncio.wait_for(call.read(), _PATIENCE_S)
         if answer is _EOF:
@@ -96,7 +106,7 @@ class Clients:
                 await asyncio.wait_for(call.read(), _PATIENCE_S)
 
     async def ends(self) -> None:
-        async with grpc.aio.insecure_channel(self.grpc_address, options=_OWN) as channel:
+        async with self.channel() as channel:
             call, _ = await self.opened_call(channel)
             await self.frames(call)
             await call.write(pb.StreamDepthRequest(end=pb.End()))
@@ -104,17 +114,17 @@ class Clients:
                 pass
 
     async def cancels(self) -> None:
-        async with grpc.aio.insecure_channel(self.grpc_address, options=_OWN) as channel:
+        async with self.channel() as channel:
             call, _ = await self.opened_call(channel)
             await self.frames(call)
             call.cancel()
 
     async def resumes(self) -> None:
-        async with grpc.aio.insecure_channel(self.grpc_address, options=_OWN) as channel:
+        async with self.channel() as channel:
             call, opened = await self.opened_call(channel)
             await self.frames(call)
             call.cancel()
-        async with grpc.aio.insecure_channel(self.grpc_address, options=_OWN) as channel:
+        async with self.channel() as channel:
             token = opened.resume_token
             call, _ = await self.opened_call(
                 channel, stream_id=opened.stream_id, resume_token=token
@@ -122,14 +132,15 @@ class Clients:
             await self.frames(call, first=100)
 
     async def is_closed_by_another(self) -> None:
-        async with grpc.aio.insecure_channel(self.grpc_address, options=_OWN) as channel:
+        async with self.channel() as channel:
             call, opened = await self.opened_call(channel)
             await self.frames(call)
             stub = depth_pb2_grpc.DepthServiceStub(channel)
-            await stub.CloseStream(pb.CloseStreamRequest(stream_id=opened.stream_id))
+            question = pb.CloseStreamRequest(stream_id=opened.stream_id)
+            await stub.CloseStream(question, metadata=self.metadata())
 
     async def sends_garbage(self) -> None:
-        async with grpc.aio.insecure_channel(self.grpc_address, options=_OWN) as channel:
+        async with self.channel() as channel:
             call, _ = await self.opened_call(channel)
             await call.write(pb.StreamDepthRequest())
             await asyncio.wait_for(call.read(), _PATIENCE_S)
@@ -138,7 +149,9 @@ class Clients:
         scheme = self.rng.choice(("grpc", "http"))
         address = self.grpc_address if scheme == "grpc" else self.http_address
         async with (
-            DepthClient(f"{scheme}://{address}") as client,
+            DepthClient(
+                f"{scheme}{'s' if _CA else ''}://{address}", token=self.token or None, ca=_CA
+            ) as client,
             client.open_session(RIG, delivery=self.rng.choice(list(Delivery))) as session,
         ):
             self.opened += 1
@@ -148,19 +161,19 @@ class Clients:
                     await session.step(frame.left, frame.right, Pose.identity())
 
     async def never_begins(self) -> None:
-        async with grpc.aio.insecure_channel(self.grpc_address, options=_OWN) as channel:
-            call = depth_pb2_grpc.DepthServiceStub(channel).StreamDepth()
+        async with self.channel() as channel:
+            call = depth_pb2_grpc.DepthServiceStub(channel).StreamDepth(metadata=self.metadata())
             await asyncio.wait_for(call.read(), _PATIENCE_S)
 
     async def is_silent(self) -> None:
-        async with grpc.aio.insecure_channel(self.grpc_address, options=_OWN) as channel:
+        async with self.channel() as channel:
             call, _ = await self.opened_call(channel)
             await call.write(pb.StreamDepthRequest(ping=pb.Ping()))
             while await asyncio.wait_for(call.read(), _PATIENCE_S) is not _EOF:
                 pass
 
     async def does_not_read(self) -> None:
-        async with grpc.aio.insecure_channel(self.grpc_address, options=_OWN) as channel:
+        async with self.channel() as channel:
             call, _ = await self.opened_call(channel, rig=StereoRig.from_rectified(LARGE))
             for index in range(1, 20):
                 await asyncio.wait_for(
@@ -172,6 +185,7 @@ class Clients:
     async def dies(self) -> None:
         child = await asyncio.create_subprocess_exec(
             *(sys.executable, "-m", "tests.support.soak_clients", self.grpc_address),
+            env={**os.environ, **({"VERGENCE_TOKEN": self.token} if self.token else {})},
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.DEVNULL,
         )
@@ -220,8 +234,25 @@ class Clients:
                     await http.get(f"{where}/result")
                 await http.delete(where)
 
+    def metadata(self) -> tuple[tuple[str, str], ...]:
+        return (("authorization", f"Bearer {self.token}"),) if self.token else ()
+
+    def channel(self) -> grpc.aio.Channel:
+        if _CA is None:
+            return grpc.aio.insecure_channel(self.grpc_address, options=_OWN)
+        credentials = grpc.ssl_channel_credentials(Path(_CA).read_bytes())
+        return grpc.aio.secure_channel(self.grpc_address, credentials, options=_OWN)
+
     def http(self) -> httpx.AsyncClient:
-        return httpx.AsyncClient(base_url=f"http://{self.http_address}", timeout=_PATIENCE_S)
+        scheme, trusted = (
+            ("https", ssl.create_default_context(cafile=_CA)) if _CA else ("http", None)
+        )
+        return httpx.AsyncClient(
+            base_url=f"{scheme}://{self.http_address}",
+            timeout=_PATIENCE_S,
+            headers=dict(self.metadata()),
+            verify=trusted or False,
+        )
 
 
 def _name_of(error: BaseException) -> str:
@@ -234,7 +265,11 @@ def _png() -> bytes:
 
 
 async def _stream_for_ever(address: str) -> None:
-    async with DepthClient(address) as client, client.open_session(RIG) as session:
+    scheme = "grpcs" if _CA else "grpc"
+    async with (
+        DepthClient(f"{scheme}://{address}", ca=_CA) as client,
+        client.open_session(RIG) as session,
+    ):
         print("opened", flush=True)  # noqa: T201  the parent reads it
         index = 0
         while True:
@@ -245,10 +280,16 @@ async def _stream_for_ever(address: str) -> None:
 
 
 async def _act(grpc_address: str, http_address: str, seed: int, seconds: float, count: int) -> None:
-    clients = Clients(grpc_address, http_address, random.Random(seed))
+    rng = random.Random(seed)
+    clients = [
+        Clients(grpc_address, http_address, rng, _TOKENS[index % len(_TOKENS)])
+        for index in range(count)
+    ]
     ends_s = time.monotonic() + seconds
-    await asyncio.gather(*(clients.run(lambda: time.monotonic() > ends_s) for _ in range(count)))
-    print(json.dumps({"opened": clients.opened, "seen": clients.seen}))  # noqa: T201  as above
+    await asyncio.gather(*(each.run(lambda: time.monotonic() > ends_s) for each in clients))
+    seen = sum((each.seen for each in clients), Counter())
+    opened = sum(each.opened for each in clients)
+    print(json.dumps({"opened": opened, "seen": seen}))  # noqa: T201  as above
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from vergence_proto.types import Timings
 from vergence_service.failures import out_of_memory
 from vergence_service.inference.arrivals import ArrivalPredictor
 from vergence_service.inference.model import Step, StepResult, StereoModel
+from vergence_service.inference.shares import Shares
 from vergence_service.memory import MemoryBudget
 from vergence_service.metrics import Metrics
 from vergence_service.threads import Cost
@@ -39,6 +40,7 @@ class _Waiting:
     since_s: float
     deadline_s: float | None
     live_stream: str | None
+    owner: str
     timings: Timings
     answer: asyncio.Future[tuple[StepResult, Timings]]
     cost: Cost
@@ -56,7 +58,8 @@ class _Waiting:
 class StepBatcher:
     """Collects the steps that wait for the model and runs them, oldest first.
 
-    Live steps run first. Other steps run in the gaps, in separate batches. A non-live step that
+    Live steps run first. Other steps run in the gaps, in separate batches: first those of the owner
+    that has used the least. A non-live step that
     would delay a live frame (running or expected soon) waits, at most ``_PATIENCE_S``. Of several
     lanes, one is never taken by such steps while there are live streams.
 
@@ -89,6 +92,7 @@ class StepBatcher:
         self._changed = asyncio.Event()  # set when a step arrives or leaves the model
         self._arrivals = ArrivalPredictor()
         metrics.streams_predicted.set_function(lambda: len(self._arrivals))
+        self._shares = Shares()
         self._work_s: dict[tuple[object, ...], float] = {}  # last duration per shape of work
 
     async def __aenter__(self) -> Self:
@@ -116,12 +120,14 @@ class StepBatcher:
         timings: Timings | None = None,
         deadline_s: float | None = None,
         live_stream: str | None = None,
+        owner: str = "",
         cost: Cost | None = None,
     ) -> tuple[StepResult, Timings]:
         """Run one step; return its result, and ``timings`` extended by the wait and the model.
 
-        ``live_stream`` is the id of the step's live stream, or None if the step is not live. What
-        the step takes of the processor, or of the device, is added to ``cost``.
+        ``live_stream`` is the id of the step's live stream, or None if the step is not live; such
+        steps are shared out by ``owner``. What the step takes of the processor, or of the device,
+        is added to ``cost``.
 
         Raises FrameStale if the model was not free before ``deadline_s``, ModelFailed or NonFinite
         if the model failed, and Draining if the batcher ends first.
@@ -129,13 +135,22 @@ class StepBatcher:
         now_s = self._clock()
         answer: asyncio.Future[tuple[StepResult, Timings]]
         answer = asyncio.get_running_loop().create_future()
-        self._waiting.append(
-            _Waiting(
-                step, now_s, deadline_s, live_stream, timings or Timings(), answer, cost or Cost()
-            )
+        item = _Waiting(
+            step,
+            now_s,
+            deadline_s,
+            live_stream,
+            owner,
+            timings or Timings(),
+            answer,
+            cost or Cost(),
         )
         if live_stream is not None:
             self._arrivals.arrived(live_stream, now_s)
+        else:
+            here = [*self._waiting, *self._in_model]
+            self._shares.enter(owner, [each.owner for each in here if not each.live])
+        self._waiting.append(item)
         self._changed.set()
         return await answer
 
@@ -211,9 +226,12 @@ class StepBatcher:
                     )
                 )
         # The sort is stable: oldest first.
-        self._waiting = sorted(_unanswered(unanswered), key=lambda item: not item.live)
+        self._waiting = sorted(_unanswered(unanswered), key=self._order)
         work = self._waiting[0].shape_of_work if self._waiting else None
         return [item for item in self._waiting if item.shape_of_work == work][: self._max_batch]
+
+    def _order(self, item: _Waiting) -> tuple[bool, float]:
+        return not item.live, 0.0 if item.live else self._shares.used_s(item.owner)
 
     async def _step_together(self, batch: list[_Waiting]) -> None:
         started_s = self._clock()
@@ -235,6 +253,8 @@ class StepBatcher:
             used_s = max(used.seconds, (self._clock() - started_s) / self._lanes)
             for item in batch:
                 item.cost.seconds += used_s / len(batch)
+                if not item.live:
+                    self._shares.charge(item.owner, used_s / len(batch))
         model_s = self._clock() - started_s
         self._note_duration(batch[0].shape_of_work, model_s)
         self._metrics.batch_size.observe(len(batch))

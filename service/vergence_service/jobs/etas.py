@@ -1,6 +1,7 @@
 """When the jobs of a queue will be done, from the speed of the last runs."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from vergence_service.jobs.job import Job
@@ -15,12 +16,24 @@ class Place:
     work: float  # of the waiting ones before it
 
 
-def places_of(unfinished: Sequence[Job], running: Mapping[str, JobProgress]) -> dict[str, Place]:
-    """Return the place of each unfinished job by its id; ``unfinished`` are in their order."""
+def in_turn(unfinished: Iterable[Job], running: Container[str]) -> list[Job]:
+    """Return jobs in the order in which they run: those of each owner in turn.
+
+    ``unfinished`` are in the order of one owner. Running ones are the first of their owner: they
+    are not stopped for one of a higher priority.
+    """
+    seen: Counter[str] = Counter()
+    ranked = []
+    for job in sorted(unfinished, key=lambda job: job.job_id not in running):
+        ranked.append((job.job_id not in running, seen[job.owner], job))
+        seen[job.owner] += 1
+    return [job for *_, job in sorted(ranked, key=lambda each: each[:2])]
+
+
+def places_of(unfinished: Iterable[Job], running: Mapping[str, JobProgress]) -> dict[str, Place]:
+    """Return the place of each unfinished job by its id; see :func:`in_turn` for their order."""
     places, work = {}, 0.0
-    # A running job is not stopped for one of a higher priority.
-    order = sorted(unfinished, key=lambda job: job.job_id not in running)
-    for ahead, job in enumerate(order):
+    for ahead, job in enumerate(in_turn(unfinished, running)):
         runs = job.job_id in running
         places[job.job_id] = Place(0 if runs else ahead, work)
         if not runs:

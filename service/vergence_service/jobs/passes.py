@@ -41,6 +41,7 @@ async def step_passes(
     start: int,
     state: RecurrentState | None,
     may_skip: MaySkip,
+    owner: str,
 ) -> AsyncGenerator[Stepped | Skipped, None]:
     """Step the frames of ``sequence`` as :func:`step_all` does, as often as ``quality`` says.
 
@@ -50,7 +51,15 @@ async def step_passes(
     """
     if quality is Quality.FAST or not _has_poses(sequence) or not engine.card.recurrent:
         async with aclosing(
-            step_all(engine, sequence, config, start=start, state=state, may_skip=may_skip)
+            step_all(
+                engine,
+                sequence,
+                config,
+                start=start,
+                state=state,
+                may_skip=may_skip,
+                owner=owner,
+            )
         ) as steps:
             async for step in steps:
                 yield step
@@ -61,7 +70,9 @@ async def step_passes(
             first, end = max(begin, start), min(begin + BLOCK, len(sequence))
             await background.run(remove_folder, scratch)
             await background.run(scratch.mkdir)
-            await _step_backward(engine, sequence, config, scratch, first=first, end=end)
+            await _step_backward(
+                engine, sequence, config, scratch, first=first, end=end, owner=owner
+            )
             # A stream at a time: two would wait for the memory of each other.
             block = dataclasses.replace(sequence, files=sequence.files[:end])
             async with aclosing(
@@ -73,6 +84,7 @@ async def step_passes(
                     state=state,
                     may_skip=may_skip,
                     alone=quality is Quality.BEST,
+                    owner=owner,
                 )
             ) as steps:
                 async for step in steps:
@@ -95,6 +107,7 @@ async def _step_backward(
     *,
     first: int,
     end: int,
+    owner: str,
 ) -> None:
     """Step the frames before ``end`` backward to ``first``, and keep their maps in ``scratch``."""
     last = min(end + _LEAD, len(sequence)) - 1
@@ -110,7 +123,8 @@ async def _step_backward(
             content = encode_frame(record, step.disparity, sigma=True)
             _path(scratch, index).write_bytes(content)
 
-    async with aclosing(step_all(engine, backward, config, may_skip=may_skip)) as steps:
+    stepping = step_all(engine, backward, config, may_skip=may_skip, owner=owner)
+    async with aclosing(stepping) as steps:
         async for step in steps:
             if isinstance(step, Stepped):
                 await engine.threads.background.run(keep, step)

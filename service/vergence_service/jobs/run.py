@@ -126,6 +126,7 @@ async def run_job(
                     start=start,
                     state=state,
                     may_skip=may_skip,
+                    owner=job.owner,
                 )
             ) as steps,
             aclosing(_started(writer.result, engine, steps, background, start)) as started,

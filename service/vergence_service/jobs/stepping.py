@@ -11,6 +11,7 @@ from vergence_proto.datasets import DatasetError, SourceFrame, StereoSource, rea
 from vergence_proto.errors import BadShape, DepthError, NonFinite
 from vergence_proto.ordered import in_order
 from vergence_proto.types import DisparityMap, Origin
+from vergence_service.access.principals import LOCAL
 from vergence_service.inference.model import RecurrentState
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.rectify import Rectifier
@@ -59,6 +60,7 @@ async def step_all(
     state: RecurrentState | None = None,
     may_skip: Callable[[DatasetError | DepthError], bool] = lambda _: False,
     alone: bool = False,
+    owner: str = LOCAL.name,
 ) -> AsyncGenerator[Stepped | Skipped, None]:
     """Step the frames of ``sequence`` in order, each from the state after the frame before.
 
@@ -71,7 +73,7 @@ async def step_all(
     a file cannot be read, BadShape or NonFinite if a frame cannot be stepped.
     """
     async with (
-        engine.offline(config, state=state) as stream,
+        engine.offline(config, state=state, owner=owner) as stream,
         aclosing(_reading(engine, sequence, start, may_skip)) as frames,
         aclosing(
             in_order(frames, partial(_step, engine, stream, may_skip, alone), limit=_IN_FLIGHT)

@@ -17,6 +17,7 @@ from vergence_proto.errors import (
 from vergence_proto.jobs import JobState
 from vergence_service.failures import error_of
 from vergence_service.jobs.checkpoints import saved_frames
+from vergence_service.jobs.etas import in_turn
 from vergence_service.jobs.job import Job
 from vergence_service.jobs.kept_uploads import KeptUploads
 from vergence_service.jobs.progress import JobProgress
@@ -102,7 +103,7 @@ class JobWorker:
                 run.task = tasks.create_task(self._run(job, run), name=f"sequence {job.job_id}")
 
     def _next(self) -> Job | None:
-        """Return the job to run now, the first that waits, or None if none may run."""
+        """Return the job to run now, or None if none may run."""
         stepping = sum(not run.stepped for run in self._runs.values())
         # A job is stepped while the one before it is finished, for disks can be slow. More than
         # one that is being finished keep others waiting.
@@ -112,7 +113,7 @@ class JobWorker:
         live = bool(self._engine.streams.attachments())
         if stepping >= (1 if live else self._engine.lanes) or finishing > 1:
             return None
-        waiting = self._jobs.unfinished()
+        waiting = in_turn(self._jobs.unfinished(), self._runs)
         return next((each for each in waiting if each.job_id not in self._runs), None)
 
     async def _change(self) -> None:

@@ -249,7 +249,7 @@ class DepthEngine:
 
     @asynccontextmanager
     async def offline(
-        self, config: StreamConfig, *, state: RecurrentState | None = None
+        self, config: StreamConfig, *, state: RecurrentState | None = None, owner: str = LOCAL.name
     ) -> AsyncIterator[Stream]:
         """Open a stream without a client, for a sequence whose frames are all known.
 
@@ -268,7 +268,7 @@ class DepthEngine:
             origin = Origin.COLD_START if state is None else Origin.WARM
             now_s = self._clock()
             stream = Stream("", "", b"", config, rectifier, memory, None, now_s)
-            stream.state, stream.origin = state, origin
+            stream.state, stream.origin, stream.owner = state, origin, Principal(owner)
             yield stream
 
     async def step_offline(
@@ -374,6 +374,7 @@ class DepthEngine:
                     timings=Timings(decode_s=decode_s, queue_s=started_s - arrived_s),
                     deadline_s=None if max_age_s is None else arrived_s + max_age_s,
                     live_stream=stream.key if live else None,
+                    owner=stream.owner.name,
                     cost=cost,
                 )
             except DepthError as error:
@@ -383,8 +384,7 @@ class DepthEngine:
                 raise
             stream.commit(frame.frame_id, result.state, frames_skipped=skipped)
         stream.note_answer(self._clock(), arrived_s, origin, iterations, timings.model_s)
-        if live:
-            self.metrics.model_s.labels(stream.owner.name).inc(timings.model_s)
+        self.metrics.model_s.labels(stream.owner.name).inc(timings.model_s)
         self.metrics.frames_stepped.labels(origin.name.lower()).inc()
         for stage in ("decode", "queue", "model"):
             self.metrics.stage_s.labels(stage).observe(getattr(timings, f"{stage}_s"))

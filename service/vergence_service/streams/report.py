@@ -49,7 +49,7 @@ class PrincipalReport:
 
     principal: str
     streams: int
-    model_s: float  # time in the model, of live streams, since the server started
+    model_s: float  # time in the model since the server started
     megapixels_per_s: float  # stepped lately, left and right images together
     memory_bytes: int  # of its streams, without steps
 

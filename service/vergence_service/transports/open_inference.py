@@ -16,6 +16,7 @@ from vergence_proto.geometry import RectifiedRig
 from vergence_proto.types import Delivery, Image, OutputFormat, StereoFrame, StereoRig
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.stream import StreamConfig
+from vergence_service.transports.callers import CALLER
 
 SERVER = "vergence"
 MODEL_VERSION = "1"
@@ -99,7 +100,7 @@ async def step_pair(engine: DepthEngine, left: Image, right: Image) -> Maps:
         StereoRig.from_rectified(rig), delivery=Delivery.EVERY, output=OutputFormat(sigma=True)
     )
     frame = StereoFrame(1, 0, left, right)
-    async with engine.offline(config) as stream:
+    async with engine.offline(config, owner=CALLER.get().name) as stream:
         found, _ = await engine.step_offline(stream, lambda: frame)
     assert found.sigma_px is not None
     # JSON has no NaN: 0 is no value, as in the files of KITTI.

@@ -34,6 +34,7 @@ from vergence_service.jobs.upload_checks import check_file
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.stream import StreamConfig
 from vergence_service.threads import ThreadPool
+from vergence_service.transports.callers import CALLER
 from vergence_service.transports.http.errors import PROBLEM_RESPONSE
 from vergence_service.transports.http.uploads import (
     FORM_TYPE,
@@ -162,7 +163,7 @@ def pair_routes(engine: DepthEngine, places: Places, *, limits: UploadLimits) ->
             cold_iterations=query.iterations,
         )
         frame = StereoFrame(1, 0, left, right)
-        async with engine.offline(config) as stream:
+        async with engine.offline(config, owner=CALLER.get().name) as stream:
             disparity, _ = await engine.step_offline(stream, lambda: frame)
         return await background.run(_answer, disparity, query, metric=metric)
 
