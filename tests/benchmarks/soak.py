@@ -171,6 +171,9 @@ async def soak(minutes: float, seed: int, *, leaky: bool, secure: bool) -> dict[
                 server.process.send_signal(signal.SIGTERM)
             code = await asyncio.wait_for(server.process.wait(), 60)
         log = (folder / "log").read_text(errors="replace")
+    if "Traceback" in log:
+        where = log.index("Traceback")
+        print(log[max(where - 500, 0) : where + 4000])  # noqa: T201
     return {**figures, "exit_code": code, "tracebacks": log.count("Traceback")}
 
 

@@ -30,9 +30,13 @@ async def hang_up(context: Context, why: str, *, reads: bool, shared: bool) -> N
     ``shared`` by other calls, close the connection.
     """
     if reads:
-        with suppress(TimeoutError):
+        try:
             async with asyncio.timeout(_STATUS_S):
                 await context.abort(grpc.StatusCode.UNAVAILABLE, why)
+        except TimeoutError:
+            pass
+        except grpc.aio.InternalError:  # the client has disconnected meanwhile
+            raise asyncio.CancelledError from None
     if shared or not _close_connection(context.peer()):
         _cancel(context)
     raise asyncio.CancelledError  # gRPC takes this as the end of a call that was cancelled
