@@ -1,23 +1,15 @@
 """Single pairs wait in a bounded queue, and leave a lane to live streams."""
 
 import asyncio
-import io
 
-import cv2
 import httpx
-import numpy as np
 
-from tests.support.http import http_to, metrics_of, reason_of
+from tests.support.http import http_to, metrics_of, pair_form, reason_of
 from tests.support.models import RecallModel
 from tests.support.polling import eventually, eventually_true, turns
 from tests.support.server import running_server
+from vergence_service.access.principals import LOCAL
 from vergence_service.jobs.places import Places
-
-
-def pair_form() -> dict[str, tuple[str, io.BytesIO, str]]:
-    image = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
-    png = cv2.imencode(".png", image)[1].tobytes()
-    return {name: (name, io.BytesIO(png), "image/png") for name in ("left", "right")}
 
 
 async def test_pairs_beyond_the_queue_are_refused_with_a_time_to_come_back() -> None:
@@ -64,7 +56,7 @@ async def test_callers_work_one_at_a_time_in_the_order_in_which_they_came() -> N
     places, order, may_go = Places(3), list[int](), asyncio.Event()
 
     async def caller(number: int) -> None:
-        async with places.taken():
+        async with places.taken(LOCAL):
             order.append(number)
             await may_go.wait()
 

@@ -11,8 +11,9 @@ import grpc
 import pytest
 
 from tests.support.frames import RIG, frame_message, make_frame, open_message
-from tests.support.http import ZIP, ended, reason_of, submit
+from tests.support.http import ZIP, ended, pair_form, reason_of, submit
 from tests.support.models import RecallModel
+from tests.support.polling import eventually
 from tests.support.sequences import make_frames, sequence_files, zip_bytes
 from tests.support.server import RawCall, running_server
 from tests.support.status import reason_of as reason_over_grpc
@@ -97,25 +98,45 @@ async def test_the_open_requests_of_one_principal_are_counted_on_all_ports(tmp_p
         assert (await ana.get("/v1/sequences")).status_code == 200
 
 
-async def test_the_results_of_one_principal_leave_disk_to_others(tmp_path: Path) -> None:
-    archive = zip_bytes(sequence_files(make_frames(40)))
+async def test_what_one_principal_keeps_leaves_disk_to_others(tmp_path: Path) -> None:
+    archive = zip_bytes(sequence_files(make_frames(2)))
+    large = {"Tus-Resumable": "1.0.0", "Upload-Length": str((1 << 20) - 100)}
     async with (
         guarded(tmp_path, limits__sequences_mib=1) as (server, file),
         http_as(server, file.shown("ana")) as ana,
         http_as(server, file.shown("ben")) as ben,
     ):
-        kept: list[str] = []
-        answer = await ana.post("/v1/sequences", content=archive, headers=ZIP)
-        while answer.status_code == 202 and len(kept) < 8:
-            kept.append(answer.json()["id"])
-            answer = await ana.post("/v1/sequences", content=archive, headers=ZIP)
-        assert kept
-        assert (answer.status_code, reason_of(answer)) == (429, "QUOTA")
-        assert "limits.sequences_mib" in answer.json()["detail"]
+        announced = await ana.post("/v1/uploads", headers=large)
+        assert announced.status_code == 201
+        for answer in (
+            await ana.post("/v1/uploads", headers=large),
+            await ana.post("/v1/sequences", content=archive, headers=ZIP),
+        ):
+            assert (answer.status_code, reason_of(answer)) == (429, "QUOTA")
+            assert "limits.sequences_mib" in answer.json()["detail"]
         await submit(ben, archive)
-        for job_id in kept:
-            await ana.delete(f"/v1/sequences/{job_id}")
+        await ana.delete(announced.headers["location"], headers={"Tus-Resumable": "1.0.0"})
         await submit(ana, archive)
+        # The job and its result count too.
+        assert (await ana.post("/v1/uploads", headers=large)).status_code == 429
+
+
+async def test_the_pairs_of_one_principal_leave_places_to_others(tmp_path: Path) -> None:
+    model = RecallModel()
+    async with (
+        guarded(tmp_path, model, limits__pairs=2) as (server, file),
+        http_as(server, file.shown("ana")) as ana,
+        http_as(server, file.shown("ben")) as ben,
+    ):
+        with model.busy():
+            first = asyncio.create_task(ana.post("/v1/pairs", files=pair_form()))
+            await asyncio.to_thread(model.wait_until_entered)
+            refused = await ana.post("/v1/pairs", files=pair_form())
+            assert (refused.status_code, reason_of(refused)) == (429, "QUOTA")
+            his = asyncio.create_task(ben.post("/v1/pairs", files=pair_form()))
+            metric = server.engine.metrics.pairs
+            await eventually(lambda: next(iter(metric.collect())).samples[0].value == 2)
+        assert [(await each).status_code for each in (first, his)] == [200, 200]
 
 
 async def test_the_jobs_of_principals_run_in_turn(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 from weakref import WeakKeyDictionary
 
+import cv2
 import httpx
 import numpy as np
 from numpy.typing import NDArray
@@ -108,3 +109,9 @@ def reason_of(answer: httpx.Response) -> str:
 
 def files_below(folder: Path) -> list[str]:
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+def pair_form() -> dict[str, tuple[str, io.BytesIO, str]]:
+    image = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
+    png = cv2.imencode(".png", image)[1].tobytes()
+    return {name: (name, io.BytesIO(png), "image/png") for name in ("left", "right")}

@@ -27,6 +27,7 @@ class KeptUpload:
     """An upload, complete or not."""
 
     upload_id: str
+    owner: str
     path: Path  # of its bytes
     length: int  # bytes that were announced
     offset: int  # bytes that have arrived
@@ -68,9 +69,16 @@ class KeptUploads:
             f"no upload {upload_id[:64]!r}: it never existed, was deleted or submitted, or expired"
         )
 
-    def held_bytes(self, besides: str = "") -> int:
-        """Return the space of all uploads as announced, without the one of the id ``besides``."""
-        return sum(each.length for each in self._all() if each.upload_id != besides)
+    def held_bytes(self, besides: str = "", owner: str | None = None) -> int:
+        """Return the space of uploads as announced, without the one of the id ``besides``.
+
+        ``owner``: only of uploads of this principal.
+        """
+        return sum(
+            each.length
+            for each in self._all()
+            if each.upload_id != besides and owner in (None, each.owner)
+        )
 
     def missing_bytes(self) -> int:
         """Return the space that uploads have announced and do not use yet."""
@@ -107,10 +115,12 @@ class KeptUploads:
 
     def _read(self, folder: Path) -> KeptUpload:
         body = (folder / _BODY).stat()
+        about = json.loads((folder / _ABOUT).read_text())
         return KeptUpload(
             folder.name,
+            str(about["owner"]),
             folder / _BODY,
-            int(json.loads((folder / _ABOUT).read_text())["length"]),
+            int(about["length"]),
             body.st_size,
             body.st_mtime + self._keep_s,
         )

@@ -95,6 +95,7 @@ class JobQueue:
             self.jobs,
             self.uploads,
             disk_bytes=limits.disk_bytes,
+            principal_bytes=limits.principal_bytes,
             background=self.threads,
         )
         self._engine = engine
@@ -255,16 +256,7 @@ class JobQueue:
 
     async def _check_disk(self, job: Job, owner: Principal, upload: str) -> None:
         try:
-            await self.room.check_job(job, upload=upload)  # which also deletes what has expired
-            used = self.jobs.used_bytes(owner=owner.name)
-            if owner.proven and used + job.disk_bytes > self._limits.principal_bytes:
-                raise Quota(
-                    f"the sequences and results of {owner.name} use {used} bytes on disk, this one "
-                    f"needs {job.disk_bytes}, and the limit of one principal is "
-                    f"{self._limits.principal_bytes}; fetch and delete results, or try again later "
-                    "(the server's setting limits.sequences_mib)",
-                    retry_after_s=self.jobs.room_in_s(),
-                )
+            await self.room.check_job(job, owner, upload=upload)
         except (QueueFull, Quota, InsufficientStorage) as error:
             self._engine.metrics.sequences_refused.inc()
             log.warning("an upload of %s was refused: %s", job.client or "a client", error)

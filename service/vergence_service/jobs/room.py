@@ -1,6 +1,7 @@
 """The disk space of jobs and uploads: what has no room is refused; no result makes room for it."""
 
-from vergence_proto.errors import QueueFull, UploadTooLarge
+from vergence_proto.errors import QueueFull, Quota, UploadTooLarge
+from vergence_service.access.principals import Principal
 from vergence_service.jobs.job import Job
 from vergence_service.jobs.kept_uploads import KeptUploads
 from vergence_service.jobs.registry import JobRegistry
@@ -10,7 +11,10 @@ from vergence_service.threads import ThreadPool
 
 
 class DiskRoom:
-    """Compares what is needed with the limit of all jobs and with the free space of the disk."""
+    """Compares what is needed with the limits of all jobs and of a principal, and with the disk.
+
+    The limit of a principal is for those that have shown a credential.
+    """
 
     def __init__(
         self,
@@ -19,12 +23,14 @@ class DiskRoom:
         uploads: KeptUploads,
         *,
         disk_bytes: int,
+        principal_bytes: int,
         background: ThreadPool,
     ) -> None:
         self._store = store
         self._jobs = jobs
         self._uploads = uploads
         self._disk_bytes = disk_bytes
+        self._principal_bytes = principal_bytes
         self._background = background
 
     async def check_free(self, needed_bytes: int, *, what: str) -> None:
@@ -41,32 +47,36 @@ class DiskRoom:
             what=what,
         )
 
-    async def check_upload(self, length: int) -> None:
+    async def check_upload(self, length: int, owner: Principal) -> None:
         """Refuse an upload of ``length`` bytes that does not fit beside all that is kept.
 
-        Raises UploadTooLarge if it can never fit, QueueFull if it does not fit now, and
-        InsufficientStorage if the disk has no room for it.
+        Raises UploadTooLarge if it can never fit, QueueFull if it does not fit now, Quota if its
+        owner has too much, and InsufficientStorage if the disk has no room for it.
         """
-        await self._check_limit(length, what="the upload", upload="")
+        await self._check_limit(length, owner, what="the upload", upload="")
         await self.check_free(length, what="the upload")
 
-    async def check_job(self, new: Job, *, upload: str = "") -> None:
+    async def check_job(self, new: Job, owner: Principal, *, upload: str = "") -> None:
         """Refuse a job that does not fit beside all results that have not expired.
 
         Its input is on the disk already; ``upload`` is the id of the upload that it came in, which
         is deleted next. Raises UploadTooLarge if the job can never fit, QueueFull if it does not
-        fit now, and InsufficientStorage if the disk has no room for its result.
+        fit now, Quota if its owner has too much, and InsufficientStorage if the disk has no room
+        for its result.
         """
-        await self._check_limit(new.disk_bytes, what="the sequence and its result", upload=upload)
+        what = "the sequence and its result"
+        await self._check_limit(new.disk_bytes, owner, what=what, upload=upload)
         await self.check_free(new.result_bytes, what="the result of the sequence")
 
-    async def _check_limit(self, needed: int, *, what: str, upload: str) -> None:
+    async def _check_limit(self, needed: int, owner: Principal, *, what: str, upload: str) -> None:
         if needed > self._disk_bytes:
             raise UploadTooLarge(
                 f"{what} need {needed} bytes, the server keeps {self._disk_bytes} for all "
                 "sequences; send it in parts, or start the server with a larger batch.disk_mib"
             )
         await self._jobs.expire()
+        if owner.proven:
+            await self._check_principal(needed, owner, what=what, upload=upload)
         held = await self._background.run(self._uploads.held_bytes, upload)
         used = self._jobs.used_bytes() + held
         if used + needed > self._disk_bytes:
@@ -75,5 +85,19 @@ class DiskRoom:
                 f"disk, {what} need {needed}, and no result is deleted before it expires; fetch "
                 "and delete results, or try again later (the server's settings batch.disk_mib, "
                 "batch.keep_h)",
+                retry_after_s=self._jobs.room_in_s(),
+            )
+
+    async def _check_principal(
+        self, needed: int, owner: Principal, *, what: str, upload: str
+    ) -> None:
+        held = await self._background.run(self._uploads.held_bytes, upload, owner.name)
+        used = self._jobs.used_bytes(owner=owner.name) + held
+        if used + needed > self._principal_bytes:
+            raise Quota(
+                f"sequences, results and uploads of {owner.name} use {used} bytes on disk, {what} "
+                f"need {needed}, and the limit of one principal is {self._principal_bytes}; fetch "
+                "and delete results, or try again later (the server's setting "
+                "limits.sequences_mib)",
                 retry_after_s=self._jobs.room_in_s(),
             )

@@ -190,7 +190,9 @@ class LimitSettings(Section):
         default=16.0, description="slowest upload and download, in KiB per second"
     )
     pairs: PositiveInt = Field(
-        default=8, description="most single pairs that wait or are stepped; one is stepped at once"
+        default=8,
+        description="most single pairs that wait or are stepped, one at a time; a principal has "
+        "half of them",
     )
     streams: PositiveInt = Field(
         default=4, description="most open streams of one principal; a token may allow others"
@@ -213,7 +215,8 @@ class LimitSettings(Section):
         default=8, description="most unfinished sequences of one principal"
     )
     sequences_mib: PositiveInt = Field(
-        default=10_240, description="disk space of all sequences and results of one principal"
+        default=10_240,
+        description="disk space of all uploads, sequences and results of one principal",
     )
     streams_per_client: PositiveInt | None = Field(
         default=None, description="most open streams of one address, over gRPC and HTTP"

@@ -20,6 +20,7 @@ from vergence_proto.types import Image
 from vergence_service.jobs.places import Places
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.transports import open_inference
+from vergence_service.transports.callers import CALLER
 from vergence_service.transports.grpc.errors import Context, errors_as_status
 from vergence_service.transports.open_inference import Maps
 
@@ -111,7 +112,7 @@ class InferenceServicer:
                     f"(limits.max_frame_mib), got {len(request)}"
                 )
             background = self._engine.threads.background
-            async with self._places.taken():
+            async with self._places.taken(CALLER.get()):
                 pair = await background.run(_pair_of, request, self._engine.max_pixels)
                 await self._check_model(
                     pair.request.model_name, pair.request.model_version, context

@@ -22,6 +22,7 @@ from vergence_proto.types import Image
 from vergence_service.jobs.places import Places
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.transports import open_inference
+from vergence_service.transports.callers import CALLER
 from vergence_service.transports.http.errors import HTTP_STATUS
 from vergence_service.transports.http.uploads import UploadLimits, body_chunks, while_connected
 from vergence_service.transports.open_inference import MODEL_VERSION, Maps
@@ -105,13 +106,13 @@ def inference_routes(engine: DepthEngine, places: Places, *, limits: UploadLimit
         if (missing := open_inference.no_such_model(model, "", engine)) is not None:
             return _unknown(missing)
         try:
-            places.check()  # before the upload, which would be for nothing
+            places.check(CALLER.get())  # before the upload, which would be for nothing
             with tempfile.TemporaryDirectory() as scratch:
                 body = Path(scratch) / "body"
                 with body.open("wb") as file:
                     async for chunk in body_chunks(request, limits):
                         await engine.threads.background.run(file.write, chunk)
-                async with while_connected(request), places.taken():
+                async with while_connected(request), places.taken(CALLER.get()):
                     length = request.headers.get(JSON_LENGTH)
                     return await _inferred(engine, body, length)
         except DepthError as error:

@@ -128,10 +128,10 @@ def pair_routes(engine: DepthEngine, places: Places, *, limits: UploadLimits) ->
 
         `curl -F left=@left.png -F right=@right.png HOST/v1/pairs -o disparity.png`
         """
-        places.check()  # before the upload, which would be for nothing
+        places.check(CALLER.get())  # before the upload, which would be for nothing
         with tempfile.TemporaryDirectory() as scratch:
             files = await _upload(request, Path(scratch), limits, engine.threads.background)
-            async with while_connected(request), places.taken():
+            async with while_connected(request), places.taken(CALLER.get()):
                 return await stepped(files, query)
 
     async def stepped(files: Mapping[str, Path], query: PairQuery) -> Response:

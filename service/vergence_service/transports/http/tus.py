@@ -69,7 +69,7 @@ def tus_routes(queue: JobQueue, uploads: KeptUploads, limits: UploadLimits) -> A
                 f"expected an upload of at most {limits.max_bytes} bytes; the server's setting "
                 f"{limits.max_bytes_setting} allows more"
             )
-        await queue.room.check_upload(upload_length)
+        await queue.room.check_upload(upload_length, CALLER.get())
         upload = await threads.run(uploads.create, CALLER.get(), upload_length)
         return _answer(201, {"Location": f"/v1/uploads/{upload.upload_id}", **_state(upload)})
 
