@@ -74,10 +74,14 @@ class StreamSaver:
         if now or due or snapshot.nbytes <= _LARGE_BYTES:
             self._begin()
 
-    async def flush(self) -> None:
-        """Write the newest snapshot, unless the store fails."""
+    def write_now(self) -> None:
+        """Write the newest snapshot, even if it is large and the last was written lately."""
         if self._newest is not None and not self._closed:
             self._begin()
+
+    async def flush(self) -> None:
+        """Write the newest snapshot, and wait until it is stored, unless the store fails."""
+        self.write_now()
         if self._writing is not None:
             await asyncio.wait([self._writing], timeout=self._snapshots.patience_s)
 

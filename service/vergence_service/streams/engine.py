@@ -339,6 +339,7 @@ class DepthEngine:
             self._reach,
             warm_iterations=self._iterations.of(config, cold=False),
             cold_iterations=self._iterations.of(config, cold=True),
+            snapshots=self.resumer.keeps_snapshots,
         )
 
     async def _rectifier(self, rig: StereoRig) -> Rectifier:

@@ -15,6 +15,8 @@ _LEAST_SIDE = 16
 _WORK_BYTES_A_PIXEL = 2 * 3 + 2 * 4 + 2 * 2
 # For each camera, positions as two int16 and one uint16; and what the left one sees.
 _MAP_BYTES_A_PIXEL = 2 * 6 + 1
+# While a snapshot is written: the state that waits, the one that is written, and its bytes, twice.
+_STATES_OF_SNAPSHOTS = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,8 +49,9 @@ def stream_memory(
     *,
     warm_iterations: int,
     cold_iterations: int,
+    snapshots: bool = False,
 ) -> StreamMemory:
-    """Return the memory that a stream of this rig needs."""
+    """Return the memory that a stream of this rig needs; ``snapshots``: if they are kept of it."""
     width, height = rig.left.width, rig.left.height
     rectified = rig.as_rectified()
     if rectified is None:  # then zero disparity is at offset 0, and nothing is moved
@@ -58,8 +61,9 @@ def stream_memory(
         searched = SearchWindow.of(rectified, reach).rig
         rows, columns = searched.height, searched.width
     steps: Iterable[tuple[int, bool]] = ((warm_iterations, False), (cold_iterations, True))
+    states = 1 + _STATES_OF_SNAPSHOTS * snapshots
     return StreamMemory(
-        state=state_bytes(model.card, rows, columns),
+        state=states * state_bytes(model.card, rows, columns),
         work=_WORK_BYTES_A_PIXEL * width * height,
         maps=0 if rectified else _MAP_BYTES_A_PIXEL * width * height,
         step=max(model.step_bytes(rows, columns, count, cold=cold) for count, cold in steps),

@@ -49,6 +49,11 @@ class StreamResumer:
         # Of each stream that is being resumed: two connections must not both restore it.
         self._turns: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
 
+    @property
+    def keeps_snapshots(self) -> bool:
+        """True if other servers can resume the streams of this one."""
+        return self._snapshots is not None
+
     def keep(self, stream: Stream, *, owner: Owner | None = None) -> None:
         """Keep snapshots of a stream that was opened, if the server keeps any."""
         if self._snapshots is not None:
@@ -145,6 +150,11 @@ class StreamResumer:
             _restore(stream, snapshot)
             self.keep(stream, owner=store_owner)
             return stream
+
+    def left(self, stream: Stream) -> None:
+        """Write the newest snapshot now, even a large one: the client may go to another server."""
+        if stream.saver is not None:
+            stream.saver.write_now()
 
     async def flush(self, stream: Stream) -> None:
         """Write the newest snapshot of a stream that another server may resume at once."""

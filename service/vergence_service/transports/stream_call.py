@@ -168,6 +168,7 @@ class DepthCall:
                 await self._serve(stream)
         finally:
             self._engine.streams.detach(stream, self)
+            self._engine.resumer.left(stream)
             self._detached.set()
         if self._error is not None:
             if isinstance(self._error, Draining):  # another server has the stream next
