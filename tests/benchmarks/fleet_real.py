@@ -349,10 +349,10 @@ async def run(options: argparse.Namespace) -> dict[str, Any]:
         for name in ("a", "b", "c"):
             await several.add_server(name)
         several.lead_to(several.servers)
-        await several.start_envoy()
-        envoy = await cost_of_envoy(several.servers[0].address, several.address, size)
+        await several.envoy.start()
+        envoy = await cost_of_envoy(several.servers[0].address, several.envoy.address, size)
         print(envoy, flush=True)  # noqa: T201  a program
-        load = Load(several.address, streams=options.streams, hz=options.hz, size=size)
+        load = Load(several.envoy.address, streams=options.streams, hz=options.hz, size=size)
         running = asyncio.create_task(load.run())
         await asyncio.sleep(LEAD_S)
         rows = await disturbances(several, load)

