@@ -17,10 +17,12 @@ from tests.support.frames import RIG
 from tests.support.models import RecallModel
 from tests.support.polling import eventually
 from tests.support.redis_server import redis_server
+from tests.support.sequences import make_frames, write_sequence
 from tests.support.server import running_server
 from tests.support.session_frames import EXACT, step
 from tests.support.tokens import TokenFile
 from vergence import Delivery, DepthClient, EventKind, SessionEvent
+from vergence.jobs.client import AsyncBatchClient
 from vergence_proto.errors import Unauthenticated
 from vergence_service.app.server import Running, drain
 
@@ -119,3 +121,20 @@ async def test_a_stream_keeps_its_server_when_it_connects_again(tmp_path: Path) 
                 async with ben.open_session(RIG, stream_id=stream_id, resume_token=token) as again:
                     await asyncio.wait_for(step(again, 2), 20)
                     assert two.server_of(stream_id) is server
+
+
+async def test_streams_and_jobs_over_http_find_their_server(tmp_path: Path) -> None:
+    room = write_sequence(tmp_path / "room", make_frames(3))
+    async with front(tmp_path) as two:
+        token, address = two.tokens.tokens["ana"], f"https://{two.envoy.http_address}"
+        async with (
+            DepthClient(address, token=token, ca=two.ca) as ana,
+            ana.open_session(RIG, delivery=Delivery.EVERY, output=EXACT) as session,
+        ):
+            counts = [(await step(session, frame_id)).step_count for frame_id in (1, 2, 3)]
+        assert counts == [1, 2, 3]
+        for _ in range(4):  # by chance, one request may reach the right server
+            async with AsyncBatchClient(address, token=token, ca=two.ca) as client:
+                job = await client.submit(room)
+                frames = [each async for each in job.frames()]
+                assert len(frames) == 3
