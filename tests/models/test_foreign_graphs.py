@@ -12,6 +12,7 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
+from onnx.external_data_helper import set_external_data
 from typer.testing import CliRunner
 
 from tests.support.foreign_graphs import (
@@ -254,9 +255,9 @@ def without_shape() -> onnx.ModelProto:
     return graph
 
 
-def of_the_future() -> onnx.ModelProto:
+def of_opset(version: int) -> onnx.ModelProto:
     graph = two_images("left", "right", "out", BYTES)
-    graph.opset_import[0].version = 99
+    graph.opset_import[0].version = version
     return graph
 
 
@@ -270,7 +271,8 @@ def with_a_plugin() -> onnx.ModelProto:
 BAD_GRAPHS: dict[str, tuple[Callable[[], onnx.ModelProto], str]] = {
     "three images": (three_images, r"expected one input with both .* guide \[1, 3, 96, 256\]"),
     "no rank": (without_shape, "left has no fixed number of dimensions"),
-    "an opset of the future": (of_the_future, "onnxruntime cannot load"),
+    "an opset of the future": (lambda: of_opset(99), "is of opset 99, and the newest here is"),
+    "an opset of the past": (lambda: of_opset(6), "onnxruntime cannot load .*This is an invalid"),
     "a plugin": (with_a_plugin, "onnxruntime cannot load .*(CostVolume|trt.plugins)"),
     "five channels": (lambda: spoiled_channels(5), "expected one input with both|only input"),
 }
@@ -296,7 +298,9 @@ def test_a_graph_that_cannot_be_served_is_refused_in_one_sentence(
 
 
 def test_a_file_that_is_no_graph_is_refused_in_one_sentence(tmp_path: Path) -> None:
-    pickled, empty, sparse, weights_gone = (tmp_path / f"{i}.onnx" for i in range(4))
+    pickled, empty, sparse, weights_gone, outside, large_beside, cut = (
+        tmp_path / f"{i}.onnx" for i in range(7)
+    )
     pickled.write_bytes(pickle.dumps({"state_dict": [1, 2, 3]}))
     empty.write_bytes(b"")
     with sparse.open("wb") as file:
@@ -306,8 +310,17 @@ def test_a_file_that_is_no_graph_is_refused_in_one_sentence(tmp_path: Path) -> N
     beside = add(tmp_path / "to", weights_gone)  # weights beside the graph are taken in
     assert beside.contract.factor == 1
     (tmp_path / "w.bin").unlink()
+    cut.write_bytes(graph.SerializeToString()[:1000])
+    for path, place in ((outside, "../w.bin"), (large_beside, sparse.name)):
+        graph = two_images("left", "right", "out", BYTES)
+        set_external_data(graph.graph.initializer[0], place)
+        path.write_bytes(graph.SerializeToString())
+    (tmp_path.parent / "w.bin").write_bytes(b"1234")
     for path, says in (
-        (pickled, "is no ONNX file"),
+        (pickled, "is no ONNX file but a checkpoint of PyTorch"),
+        (cut, "is no ONNX file"),
+        (outside, "points outside the directory"),
+        (large_beside, r"^5\.onnx has more than 2 GB of weights"),
         (empty, "is no ONNX file"),
         (sparse, "more than 2 GB of weights"),
         (weights_gone, r"lie beside it in w\.bin, which cannot be read"),

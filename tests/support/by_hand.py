@@ -12,35 +12,34 @@ from numpy.typing import NDArray
 from vergence_models.foreign.textures import Scene
 
 Image = NDArray[np.uint8]
-Feeds = Callable[[Image, Image], Mapping[str, NDArray[Any]]]
+Plane = NDArray[Any]  # float32
+Feeds = Callable[[Image, Image], Mapping[str, Plane]]
 
 _MEAN = np.array([0.485, 0.456, 0.406], np.float32)
 _STD = np.array([0.229, 0.224, 0.225], np.float32)
 
 
-def _planes(image: NDArray[np.float32]) -> NDArray[np.float32]:
+def _planes(image: Plane) -> Plane:
     return np.ascontiguousarray(image.transpose(2, 0, 1)[None])
 
 
-def _two(left: str, right: str, scaled: Callable[[Image], NDArray[np.float32]]) -> Feeds:
+def _two(left: str, right: str, scaled: Callable[[Image], Plane]) -> Feeds:
     return lambda a, b: {left: _planes(scaled(a)), right: _planes(scaled(b))}
 
 
-def _bytes(image: Image) -> NDArray[np.float32]:
+def _bytes(image: Image) -> Plane:
     return image.astype(np.float32)
 
 
-def _imagenet(image: Image) -> NDArray[np.float32]:
-    normalised: NDArray[np.float32] = (image.astype(np.float32) / 255 - _MEAN) / _STD
-    return normalised
+def _imagenet(image: Image) -> Plane:
+    return (_bytes(image) / 255 - _MEAN) / _STD
 
 
-def _grey(image: Image) -> NDArray[np.float32]:
-    grey: NDArray[np.float32] = cv2.cvtColor(_bytes(image), cv2.COLOR_RGB2GRAY)[..., None]
-    return grey
+def _grey(image: Image) -> Plane:
+    return cv2.cvtColor(_bytes(image), cv2.COLOR_RGB2GRAY)[..., None]
 
 
-def _halves(left: Image, right: Image) -> Mapping[str, NDArray[Any]]:
+def _halves(left: Image, right: Image) -> Mapping[str, Plane]:
     large = [_bytes(left), _bytes(right)]
     small = [cv2.resize(each, None, fx=0.5, fy=0.5) for each in large]
     names = ("init_left", "init_right", "next_left", "next_right")
@@ -65,7 +64,7 @@ _FEEDS: dict[str, Feeds] = {
         "b": _bytes(b)[None] / 255,
     },
 }
-_FROM_OUTPUT: dict[str, Callable[[NDArray[np.float32]], NDArray[np.float32]]] = {
+_FROM_OUTPUT: dict[str, Callable[[Plane], Plane]] = {
     "raft": lambda found: -found,
     "raft of any size": lambda found: -found,
     "crestereo": lambda found: found[:, 0],
@@ -73,10 +72,12 @@ _FROM_OUTPUT: dict[str, Callable[[NDArray[np.float32]], NDArray[np.float32]]] = 
 }
 
 
-def disparity_by_hand(layout: str, path: Path, pair: Scene) -> NDArray[np.float32]:
+def disparity_by_hand(layout: str, path: Path, pair: Scene) -> Plane:
     """Disparity [H, W] in pixels of the graph in ``path``, run by onnxruntime alone."""
-    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    session: Any = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
     feeds = dict(_FEEDS[layout](pair.left, pair.right))
     found, *_ = session.run(None, feeds)
-    disparity = _FROM_OUTPUT.get(layout, lambda found: found)(found)
+    if layout in _FROM_OUTPUT:
+        found = _FROM_OUTPUT[layout](found)
+    disparity: Plane = found
     return disparity.reshape(pair.truth_px.shape)

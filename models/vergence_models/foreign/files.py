@@ -33,6 +33,7 @@ from vergence_proto.model_io import MANIFEST_FORMAT, MANIFEST_NAME, ManifestErro
 _MOST_BYTES = (2 << 30) - (16 << 20)  # protobuf's limit of one message, with room for the names
 # The server finds these before it looks into the user's folder.
 _OWN_NAMES = {"lite", "full", "fast", "sgbm", "sgbm-half"}
+_CHECKPOINT = (b"\x80", b"PK")  # how a pickle begins, and a zip of them
 _NAME = re.compile(r"[a-z0-9][a-z0-9._-]*")
 
 
@@ -46,11 +47,26 @@ def read_graph(path: Path) -> ModelProto:
     if size > _MOST_BYTES:
         raise ContractError(too_large)
     try:
+        with path.open("rb") as file:
+            if file.read(2).startswith(_CHECKPOINT):
+                raise ContractError(
+                    f"{path.name} is no ONNX file but a checkpoint of PyTorch; export its network "
+                    "with torch.onnx.export"
+                )
         model = onnx.load(path, load_external_data=False)
+    except ContractError:
+        raise
     except (DecodeError, ValueError, OSError, RuntimeError) as error:
         raise ContractError(f"{path.name} is no ONNX file: {first_line(error)}") from None
     if not model.graph.node:
         raise ContractError(f"{path.name} is no ONNX file: it holds no operators")
+    opsets = [each.version for each in model.opset_import if each.domain in ("", "ai.onnx")]
+    newest = onnx.defs.onnx_opset_version()
+    if max(opsets, default=1) > newest:
+        raise ContractError(
+            f"{path.name} is of opset {max(opsets)}, and the newest here is {newest}; export it "
+            "with an older one, or install a newer onnx"
+        )
     beside = {
         entry.value
         for tensor in model.graph.initializer
@@ -60,15 +76,16 @@ def read_graph(path: Path) -> ModelProto:
     }
     try:
         size += sum((path.parent / name).stat().st_size for name in beside)
-        if size > _MOST_BYTES:
-            raise ContractError(too_large)
-        load_external_data_for_model(model, str(path.parent))
+        if size <= _MOST_BYTES:
+            load_external_data_for_model(model, str(path.parent))
     except (OSError, ValueError, onnx.checker.ValidationError) as error:
         names = ", ".join(sorted(beside))
         raise ContractError(
             f"the weights of {path.name} lie beside it in {names}, which cannot be read: "
             f"{first_line(error)}"
         ) from None
+    if size > _MOST_BYTES:
+        raise ContractError(too_large)
     return model
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,11 @@ def session_of(graph: bytes | Path, what: str) -> onnxruntime.InferenceSession:
 
 
 def first_line(error: BaseException) -> str:
-    lines = str(error).strip().splitlines()
+    """The first line of a message, without onnxruntime's status and the place of a file."""
+    text = re.sub(
+        r"^\[ONNXRuntimeError\] : \d+ : \w+ : (Load model from \S+ failed:)?", "", str(error)
+    )
+    lines = text.strip().splitlines()
     return lines[0][:300] if lines else type(error).__name__
 
 
