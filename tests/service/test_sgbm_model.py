@@ -1,5 +1,7 @@
 """The classical baseline is served as any model without memory."""
 
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -81,3 +83,24 @@ def test_any_size_is_matched_and_no_row_depends_on_its_neighbours(model: SgbmMod
         assert one.state.tensors == ()
         assert np.isfinite(one.offset_px).all()
     assert np.median(one.offset_px[8:-8, 30:-8]) == pytest.approx(6, abs=0.3)
+
+
+def test_without_onnxruntime_the_classical_baseline_is_served_and_nothing_else() -> None:
+    program = """
+import sys
+sys.modules["onnxruntime"] = None
+from vergence_service.app.server import make_model
+from vergence_service.inference.installed import ProviderUnavailable
+from vergence_service.settings import load_settings
+print(make_model(load_settings(flags={"model.name": "sgbm"})).engine)
+try:
+    make_model(load_settings())
+except ProviderUnavailable as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    engine, refused = done.stdout.splitlines()
+    assert engine.startswith("OpenCV")
+    assert refused.startswith("lite needs onnxruntime, which is not installed; install it: ")
+    assert refused.endswith("--model sgbm")

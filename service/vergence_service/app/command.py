@@ -14,7 +14,7 @@ from vergence_proto.model_io import ManifestError
 from vergence_service.app.security import check_exposure
 from vergence_service.app.server import Running, serve
 from vergence_service.descriptors import raise_descriptor_limit
-from vergence_service.inference.providers import ProviderUnavailable
+from vergence_service.inference.installed import ProviderUnavailable
 from vergence_service.logs import start_logging
 from vergence_service.malloc import keep_freed_memory, save_address_space
 from vergence_service.settings import SettingsError, load_settings

@@ -6,7 +6,7 @@ from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager, closing, nullcontext
 from dataclasses import dataclass
 from importlib.metadata import version
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from prometheus_client import CollectorRegistry, ProcessCollector
 
@@ -25,9 +25,9 @@ from vergence_service.app.snapshots import make_snapshots
 from vergence_service.app.zenoh import ZenohTransport, serving_zenoh
 from vergence_service.descriptors import affordable_connections
 from vergence_service.inference.batcher import StepBatcher
-from vergence_service.inference.engines import ServedModel, load_model
+from vergence_service.inference.engines import load_model
+from vergence_service.inference.installed import packaged_weights_dir
 from vergence_service.inference.model import StereoModel
-from vergence_service.inference.onnx_model import packaged_weights_dir
 from vergence_service.jobs.places import Places
 from vergence_service.jobs.queue import JobQueue
 from vergence_service.memory import MemoryBudget, affordable_bytes
@@ -50,6 +50,9 @@ from vergence_service.transports.open_calls import OpenCalls
 from vergence_service.transports.stream_call import StreamLimits
 from vergence_service.transports.unary import UnaryMethods
 
+if TYPE_CHECKING:
+    from vergence_service.inference.engines import ServedModel
+
 _MIB = 1 << 20
 _SWEEP_EVERY_S = 1.0
 
@@ -69,7 +72,7 @@ class Running:
     loading: asyncio.Task[None]  # of the graphs that live streams do not need
 
 
-def make_model(settings: Settings) -> ServedModel:
+def make_model(settings: Settings) -> "ServedModel":
     """Load the model card of the settings.
 
     Raises ManifestError if the manifest cannot be used, ProviderUnavailable if the engine or an

@@ -1,17 +1,26 @@
-"""The choice of the engine that computes a model."""
+"""The choice of the engine that computes a model.
+
+An engine is imported when it is chosen: `sgbm` is served without onnxruntime.
+"""
+
+from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
 
-from vergence_service.inference.native_model import NativeStereoModel
-from vergence_service.inference.onnx_model import OnnxStereoModel
-from vergence_service.inference.providers import ProviderUnavailable
+from vergence_proto.extras import how_to_install
+from vergence_service.inference.installed import ProviderUnavailable
 from vergence_service.inference.sgbm_model import SGBM_MODELS, SgbmModel
+
+if TYPE_CHECKING:
+    from vergence_service.inference.native_model import NativeStereoModel
+    from vergence_service.inference.onnx_model import OnnxStereoModel
 
 log = logging.getLogger(__name__)
 
-ServedModel = OnnxStereoModel | NativeStereoModel | SgbmModel
+ServedModel: TypeAlias = "OnnxStereoModel | NativeStereoModel | SgbmModel"
 
 NATIVE_MODEL = "lite"  # the model that the native engine has kernels for
 
@@ -39,6 +48,16 @@ def load_model(
                 f"OpenCV computes {name}; set model.engine to auto, not {engine!r}"
             )
         return SgbmModel(name, threads=threads)
+    try:
+        from vergence_service.inference.native_model import NativeStereoModel
+        from vergence_service.inference.onnx_model import OnnxStereoModel
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != "onnxruntime":
+            raise
+        raise ProviderUnavailable(
+            f"{name} needs onnxruntime, which is not installed; install it: "
+            f"{how_to_install('server')}; or serve the classical baseline: --model sgbm"
+        ) from None
     if engine == "native" and providers[0] != "cpu":
         raise ProviderUnavailable(
             f"the native engine runs on the CPU; set model.providers to cpu, not {providers[0]!r}, "

@@ -7,7 +7,6 @@ steps run in parallel instead, and each runs its graphs one after the other.
 """
 
 import logging
-import os
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 from onnxruntime import InferenceSession, RunOptions, SessionOptions
 
 from vergence_proto.model_io import DISPARITY, SIGMA, ManifestError, ModelCard, Stages
+from vergence_service.inference.installed import usable_cores
 from vergence_service.inference.providers import (
     DeviceTensor,
     Tensor,
@@ -220,8 +220,3 @@ def _input_names(session: InferenceSession) -> tuple[str, ...]:
 
 def _output_names(session: InferenceSession) -> tuple[str, ...]:
     return tuple(entry.name for entry in session.get_outputs())
-
-
-def usable_cores() -> int:
-    """Count the cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from vergence_proto.geometry import Pose, RectifiedRig, uvd_curr_from_prev
 from vergence_proto.model_io import ModelCard
 from vergence_proto.types import Image, Plane
-from vergence_service.inference.providers import Tensor
+from vergence_service.inference.tensors import Tensor
 
 _NO_MOTION = np.eye(4, dtype=np.float32)
 

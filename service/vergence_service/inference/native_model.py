@@ -13,10 +13,10 @@ import numpy as np
 from vergence_native import LiteStep, NativeUnavailable, NotFinite, Threads, UnsupportedWeights
 from vergence_proto.errors import NonFinite
 from vergence_proto.model_io import ModelCard
-from vergence_service.inference.graphs import usable_cores
+from vergence_service.inference.installed import ProviderUnavailable, usable_cores
 from vergence_service.inference.model import RecurrentState, Step, StepResult
-from vergence_service.inference.onnx_model import OnnxStereoModel, on_host
-from vergence_service.inference.providers import ProviderUnavailable
+from vergence_service.inference.onnx_model import OnnxStereoModel
+from vergence_service.inference.tensors import on_host
 
 # Bytes per pixel of a step's buffers and results, an upper bound; a test measures again.
 _STEP_BYTES = 64

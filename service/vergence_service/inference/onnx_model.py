@@ -1,6 +1,5 @@
 """A stereo model that runs as ONNX graphs in onnxruntime."""
 
-import importlib.util
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,6 +19,7 @@ from vergence_proto.model_io import (
     load_model_card,
 )
 from vergence_service.inference.graphs import GraphRunner
+from vergence_service.inference.installed import packaged_weights_dir as packaged_weights_dir
 from vergence_service.inference.model import RecurrentState, Step, StepResult
 from vergence_service.inference.providers import (
     ENGINE,
@@ -28,6 +28,7 @@ from vergence_service.inference.providers import (
     device_of,
     require_provider,
 )
+from vergence_service.inference.tensors import on_host as on_host
 
 # What onnxruntime says if an allocation fails: its arena, and C++.
 _NO_MEMORY = re.compile("Failed to allocate memory|bad_alloc|bad allocation|Available memory of")
@@ -176,11 +177,6 @@ def _bytes_of(measured: tuple[float, float], pixels: int, columns: int) -> int:
     return _BESIDE_PIXELS + int(pixels * (per_pixel + per_column * columns))
 
 
-def on_host(tensor: Tensor) -> NDArray[np.float32]:
-    """Return the tensor of one stream in host memory: [C, h, w]."""
-    return tensor.on_host()[0] if isinstance(tensor, DeviceTensor) else tensor
-
-
 def _batch_on_host(tensor: Tensor) -> NDArray[np.float32]:
     return tensor.on_host() if isinstance(tensor, DeviceTensor) else tensor
 
@@ -191,19 +187,6 @@ def _rows(tensors: Sequence[Tensor], count: int) -> list[tuple[Tensor, ...]]:
         return [tuple(tensors)]
     batches = [*map(_batch_on_host, tensors)]
     return [tuple(batch[row] for batch in batches) for row in range(count)]
-
-
-def packaged_weights_dir() -> Path:
-    """Return the folder of the installed weights, without importing their package.
-
-    Raises FileNotFoundError if no weights are installed.
-    """
-    spec = importlib.util.find_spec("vergence_models")
-    if spec is None or not spec.submodule_search_locations:
-        raise FileNotFoundError(
-            "no weights are installed; name a folder with a manifest.json in model.weights"
-        )
-    return Path(next(iter(spec.submodule_search_locations))) / "weights"
 
 
 def _stack(rows: Sequence[NDArray[np.generic]]) -> NDArray[np.generic]:

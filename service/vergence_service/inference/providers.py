@@ -1,7 +1,6 @@
 """The execution providers of onnxruntime, and runs whose states stay on the device."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -9,14 +8,12 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
+from vergence_service.inference.installed import PROVIDERS as PROVIDERS
+from vergence_service.inference.installed import ProviderUnavailable as ProviderUnavailable
+from vergence_service.inference.tensors import DeviceTensor as DeviceTensor
+from vergence_service.inference.tensors import Tensor as Tensor
+
 ENGINE = f"onnxruntime {onnxruntime.__version__}"
-# The names in the settings, and the names in onnxruntime.
-PROVIDERS: Mapping[str, str] = {
-    "cpu": "CPUExecutionProvider",
-    "cuda": "CUDAExecutionProvider",
-    "tensorrt": "TensorrtExecutionProvider",
-    "openvino": "OpenVINOExecutionProvider",
-}
 # Each wheel of onnxruntime contains some providers; only one wheel can be installed at a time.
 _WHEELS: Mapping[str, str] = {
     "cpu": "onnxruntime",
@@ -26,28 +23,6 @@ _WHEELS: Mapping[str, str] = {
 }
 # Providers with their own memory, and the name of their device in onnxruntime.
 _DEVICES: Mapping[str, str] = {"cuda": "cuda", "tensorrt": "cuda"}
-
-
-class ProviderUnavailable(RuntimeError):
-    """A requested execution provider cannot be used on this machine."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DeviceTensor:
-    """A tensor that stays on its device. Tensors of a state are float32."""
-
-    value: onnxruntime.OrtValue
-
-    @property
-    def nbytes(self) -> int:
-        return 4 * int(np.prod(self.value.shape()))
-
-    def on_host(self) -> NDArray[np.float32]:
-        copy: NDArray[np.float32] = self.value.numpy()
-        return copy
-
-
-Tensor = NDArray[np.float32] | DeviceTensor
 
 
 def require_provider(name: str) -> str:

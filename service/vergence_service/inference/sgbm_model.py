@@ -11,9 +11,8 @@ import numpy as np
 
 from vergence_proto.model_io import ModelCard
 from vergence_proto.sgbm import sgbm_matches
-from vergence_service.inference.graphs import usable_cores
+from vergence_service.inference.installed import PROVIDERS, usable_cores
 from vergence_service.inference.model import RecurrentState, Step, StepResult
-from vergence_service.inference.providers import PROVIDERS
 
 # The models, and the size at which each matches.
 SGBM_MODELS = {"sgbm": 1.0, "sgbm-half": 0.5}

@@ -10,7 +10,7 @@ import numpy as np
 
 from vergence_proto.geometry import Pose, RectifiedRig
 from vergence_service.inference.model import RecurrentState
-from vergence_service.inference.onnx_model import on_host
+from vergence_service.inference.tensors import on_host
 
 _ABOUT = "about"
 
