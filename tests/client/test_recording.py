@@ -270,6 +270,7 @@ def test_an_mcap_of_something_else_is_named(tmp_path: Path) -> None:
         writer.finish()  # type: ignore[no-untyped-call]  # mcap states no type here
     with pytest.raises(DatasetError, match="expected a recording of a session"):
         open_source(f"mcap:{path}")
-    path.write_bytes(b"not an MCAP file")
-    with pytest.raises(DatasetError, match="was cut or is damaged"):
-        open_source(f"mcap:{path}")
+    for content in (b"not an MCAP file", b"\x89MCAP0\r\n", b"\x89MCAP0\r\nabc"):
+        path.write_bytes(content)
+        with pytest.raises(DatasetError, match="was cut or is damaged"):
+            open_source(f"mcap:{path}")

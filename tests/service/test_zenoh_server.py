@@ -1,5 +1,6 @@
 """The server as seen from the Zenoh network: keys, encodings, answers to foreign clients."""
 
+import json
 import stat
 import sys
 from collections.abc import AsyncIterator
@@ -13,6 +14,7 @@ from google.protobuf.message import Message
 from google.protobuf.wrappers_pb2 import BytesValue
 from google.rpc import status_pb2
 
+from tests.support.certificates import Authority
 from tests.support.frames import RIG, frame_message, make_frame, open_message
 from tests.support.models import RecallModel
 from tests.support.server import running_server
@@ -324,3 +326,29 @@ async def spying(spy: ZenohSession, *principals: str) -> AsyncIterator[list[str]
         yield seen
     finally:
         await spy.close()
+
+
+async def test_a_stream_runs_over_quic(tmp_path: Path) -> None:
+    authority = Authority(tmp_path)
+    mine, endpoint = authority.issue("server"), free_endpoint().replace("tcp/", "quic/")
+    certificate = {"listen_certificate": str(mine.cert), "listen_private_key": str(mine.key)}
+    server_file, client_file = tmp_path / "server.json5", tmp_path / "client.json5"
+    server_file.write_text(
+        json.dumps(
+            {
+                "mode": "router",
+                "listen": {"endpoints": [endpoint]},
+                "transport": {"link": {"tls": certificate}},
+            }
+        )
+    )
+    trusted = {"root_ca_certificate": str(authority.ca)}
+    client_file.write_text(json.dumps({"transport": {"link": {"tls": trusted}}}))
+    address = f"zenoh+quic://{endpoint.removeprefix('quic/')}?config={client_file}"
+    async with (
+        running_server(RecallModel(), zenoh__enabled=True, zenoh__config=server_file),
+        DepthClient(address) as client,
+        client.open_session(RIG) as session,
+    ):
+        left, right = make_frame(1).left, make_frame(1).right
+        assert (await session.step(left, right)).step_count == 1

@@ -4,6 +4,7 @@ Images and poses are those that the server got, so that a replay gives the same 
 bit. Reading needs the package mcap, which the extra ``record`` brings.
 """
 
+import errno
 import itertools
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -257,9 +258,12 @@ def _opened(path: Path) -> Iterator["McapReader"]:
     with path.open("rb") as file:
         try:
             yield make_reader(file)
-        except (DatasetError, OSError):
+        except DatasetError:
             raise
         except Exception as error:  # mcap lets those of struct, lz4 and zstandard through
+            # It seeks before the start of a file that is shorter than its footer.
+            if isinstance(error, OSError) and error.errno != errno.EINVAL:
+                raise
             raise DatasetError(
                 f"{path}: this MCAP file was cut or is damaged ({type(error).__name__}: {error})"
             ) from None

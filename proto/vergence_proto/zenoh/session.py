@@ -39,7 +39,10 @@ _DEFAULTS: dict[str, Any] = {
     # In milliseconds: detect a silent peer after this time. The default is ten seconds.
     "transport/link/tx/lease": 5000,
     # In microseconds. Over Wi-Fi, sending a raw pair takes longer than the default of 50 ms, and
-    # every pair would be dropped. Credit limits how many wait.
+    # every pair would be dropped. The wait for the first part is doubled for each one that follows,
+    # and its default of 1 ms drops the first large frames on a link of 20 Mbit/s. Credit limits how
+    # many wait.
+    "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 100_000,
     "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": 500_000,
     # The default waits seconds between attempts, and a stream must resume within the server's
     # grace period.

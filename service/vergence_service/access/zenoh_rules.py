@@ -8,6 +8,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+# As in vergence_proto.zenoh.session.
+_DROP = {"wait_before_drop": 100_000, "max_wait_before_drop_fragments": 500_000}
+
 
 def router_config(
     names: Iterable[str],
@@ -26,7 +29,7 @@ def router_config(
     link: dict[str, Any] = {
         "tx": {
             "lease": 5000,
-            "queue": {"congestion_control": {"drop": {"max_wait_before_drop_fragments": 500_000}}},
+            "queue": {"congestion_control": {"drop": _DROP}},
         },
         "rx": {"max_message_size": max_message_bytes},
     }
@@ -66,9 +69,7 @@ def client_config(name: str, password: str) -> dict[str, Any]:
             "link": {
                 "tx": {
                     "lease": 5000,
-                    "queue": {
-                        "congestion_control": {"drop": {"max_wait_before_drop_fragments": 500_000}}
-                    },
+                    "queue": {"congestion_control": {"drop": _DROP}},
                 }
             },
             "auth": {"usrpwd": {"user": name, "password": password}},
