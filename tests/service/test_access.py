@@ -460,3 +460,33 @@ async def test_a_page_of_a_named_origin_may_call() -> None:
             refused = await http.post(url, content=body, headers={**headers, "Origin": other})
             assert refused.status_code == 403
             assert "access-control-allow-origin" not in refused.headers
+
+
+@pytest.mark.parametrize(
+    ("traceparent", "found"),
+    [
+        ("00-4bf92f3577b34da6a3ce929d0e0e4736-00f067aa0ba902b7-01", True),
+        ("00-00000000000000000000000000000000-00f067aa0ba902b7-01", False),
+        ("00-4bf92f3577b34da6a3ce929d0e0e4736-00f067aa0ba902b7", False),
+        ("00-4bf92f3577b34da6a3ce929d0e0e4736 event=forged-00f067aa0ba902b7-01", False),
+    ],
+    ids=["valid", "of zeros", "cut", "with words"],
+)
+async def test_the_log_names_the_trace_of_a_client(
+    traceparent: str, found: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    body = open_message("over-http").SerializeToString()
+    async with (
+        running_server(RecallModel()) as server,
+        stub(server) as calls,
+        http_to(server) as http,
+    ):
+        headers = {"traceparent": traceparent}
+        async with http.stream("POST", "/v1/streams", content=body, headers=PROTOBUF | headers):
+            pass
+        metadata = tuple(headers.items())
+        await RawCall(calls.StreamDepth(metadata=metadata)).ask(open_message("over-grpc"))
+    opened = [each.getMessage() for each in caplog.records if "stream opened" in each.getMessage()]
+    assert len(opened) == 2
+    assert all(("trace_id=4bf92f3577b34da6a3ce929d0e0e4736" in each) is found for each in opened)

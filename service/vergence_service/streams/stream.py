@@ -40,6 +40,11 @@ class Attachment(Protocol):
         ...
 
     @property
+    def trace_id(self) -> str:
+        """The id of the client's trace, for the log; empty: none."""
+        ...
+
+    @property
     def busy(self) -> bool:
         """True while a frame of the client waits or is stepped."""
         ...
@@ -105,6 +110,7 @@ class Stream:
     warned: bool = False  # the client knows that the stream will expire
     turn: asyncio.Lock = field(default_factory=asyncio.Lock)
     owner: Principal = LOCAL
+    trace_id: str = ""
     transport: str = ""  # over which the client is attached
     # For administrators: when the last frames were stepped and how old they were then, in seconds.
     answers: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=512))

@@ -183,6 +183,7 @@ class StreamTable:
             self._clock(),
             owner=place.owner,
             transport=attachment.transport if attachment else "",
+            trace_id=attachment.trace_id if attachment else "",
         )
         self._streams[place.key] = stream
         self._metrics.streams_opened.inc()
@@ -222,7 +223,7 @@ class StreamTable:
             )
         stream.config = config
         stream.attachment = attachment
-        stream.transport = attachment.transport
+        stream.transport, stream.trace_id = attachment.transport, attachment.trace_id
         stream.client = client  # the client may have changed its network
         stream.owner = owner  # and its token
         if stream.state is not None:
@@ -365,6 +366,7 @@ def _about(stream: Stream) -> dict[str, object]:
         "principal": stream.owner.name,
         "transport": stream.transport,
         "address": stream.client,
+        **({"trace_id": stream.trace_id} if stream.trace_id else {}),
     }
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import grpc
 
 from vergence_service.access.gate import Gate
-from vergence_service.transports.callers import CALLER
+from vergence_service.transports.callers import CALLER, TRACE_ID, trace_id_of
 from vergence_service.transports.grpc.errors import Context, errors_as_status
 
 # A load balancer asks for the health without a credential.
@@ -32,13 +32,13 @@ class Identity(grpc.aio.ServerInterceptor):  # type: ignore[type-arg] # of its s
         if handler is None or handler_call_details.method.startswith(_OPEN):
             return handler
         metadata = dict(handler_call_details.invocation_metadata or ())
-        authorization = metadata.get("authorization")
-        if isinstance(authorization, bytes):
-            authorization = authorization.decode("latin-1")
+        authorization = _text(metadata.get("authorization"))
+        trace_id = trace_id_of(_text(metadata.get("traceparent")))
         changed = {
             kind: self._behind(
                 behaviour,
                 authorization,
+                trace_id,
                 handler_call_details.method.startswith(_ADMINISTRATIVE),
             )
             for kind in ("unary_unary", "unary_stream", "stream_unary", "stream_stream")
@@ -47,13 +47,19 @@ class Identity(grpc.aio.ServerInterceptor):  # type: ignore[type-arg] # of its s
         return handler._replace(**changed)
 
     def _behind(
-        self, behaviour: Callable[..., Any], authorization: str | None, administrative: bool
+        self,
+        behaviour: Callable[..., Any],
+        authorization: str | None,
+        trace_id: str,
+        administrative: bool,
     ) -> Any:
         async def answer(request: Any, context: Context) -> Any:
+            TRACE_ID.set(trace_id)
             async with self._admitted(context, authorization, administrative):
                 return await behaviour(request, context)
 
         async def answers(request: Any, context: Context) -> AsyncIterator[Any]:
+            TRACE_ID.set(trace_id)
             async with self._admitted(context, authorization, administrative):
                 async for each in behaviour(request, context):
                     yield each
@@ -72,6 +78,10 @@ class Identity(grpc.aio.ServerInterceptor):  # type: ignore[type-arg] # of its s
                 stack.enter_context(self._gate.requests.of(caller))
                 CALLER.set(caller)
             yield
+
+
+def _text(value: str | bytes | None) -> str | None:
+    return value.decode("latin-1") if isinstance(value, bytes) else value
 
 
 def _certificate_names(context: Context) -> Sequence[str]:
