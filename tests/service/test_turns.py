@@ -47,7 +47,7 @@ class Model:
                 turn.cost.seconds = self._costs_s[name]
                 self.used_s[owner.name] += turn.cost.seconds
                 self.count[name] += 1
-            self.turns.charge(name, owner, self._encoding_s.get(name, 0.0))
+            self.turns.charge(name, self._encoding_s.get(name, 0.0))
 
     async def run(self, owners: Mapping[str, Principal], seconds: float) -> None:
         """Give every stream turns as fast as it wants them, side by side in the lanes."""

@@ -43,6 +43,7 @@ class _Account:
 @dataclass(slots=True, eq=False)
 class _StreamAccount(_Account):
     cost_s: float = 0.0  # of a turn, lately
+    owed_s: float = 0.0  # work beside its turns, to be charged with the next one
     last: "Turn | None" = None
 
 
@@ -124,10 +125,14 @@ class Turns:
                 self._end(turn)
             self._grant_soon()
 
-    def charge(self, stream: str, owner: Principal, seconds: float) -> None:
-        """Charge work that was done for a stream after its turn."""
-        if owner.name in self._principals:
-            self._charge(stream, owner, seconds)
+    def charge(self, stream: str, seconds: float) -> None:
+        """Charge work that was done for a stream beside its turns.
+
+        Its next turn is charged for it. Before, it would lose its place among those that wait, and
+        its frame would be old when it has its turn.
+        """
+        if (account := self._streams.get(stream)) is not None:
+            account.owed_s += seconds
 
     def _enter(self, turn: Turn, now_s: float) -> None:
         """Open the accounts of a turn, or bring them up to date."""
@@ -157,6 +162,8 @@ class Turns:
             self._running.append(turn)
             if (account := self._streams.get(turn.stream)) is not None:
                 account.last = turn
+                self._charge(turn.stream, turn.owner, account.owed_s)
+                account.owed_s = 0.0
             # As if it had ended already: the next choice must know of it.
             self._charge(turn.stream, turn.owner, turn.expected_s)
             self._notice(turn)

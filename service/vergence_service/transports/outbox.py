@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 from vergence_proto import codec
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_service.access.principals import Principal
 from vergence_service.failures import out_of_memory
 from vergence_service.metrics import Metrics
 from vergence_service.streams.conversion import SteppedFrame
@@ -40,8 +39,8 @@ class _Ping:
 class Outbox:
     """A queue of answers: several tasks put, one sends in order. Threads encode the maps.
 
-    ``on_encoded`` is called with the key and the owner of a map's stream, and with the processor's
-    time for the map in seconds.
+    ``on_encoded`` is called with the key of a map's stream, and with the processor's time for the
+    map in seconds.
     """
 
     def __init__(
@@ -51,7 +50,7 @@ class Outbox:
         clock: Callable[[], float],
         metrics: Metrics,
         threads: ThreadPool,
-        on_encoded: Callable[[str, Principal, float], None],
+        on_encoded: Callable[[str, float], None],
         on_sent: Callable[[SteppedFrame], None],
     ) -> None:
         self._write = write
@@ -110,7 +109,7 @@ class Outbox:
                 case _Map(stepped, map_step):
                     cost = Cost()
                     response = await self._threads.run(cost.of, self._encoded, stepped, map_step)
-                    self._on_encoded(stepped.stream.key, stepped.stream.owner, cost.seconds)
+                    self._on_encoded(stepped.stream.key, cost.seconds)
                     await self._write(response)
                     self._unsent.release()
                     self._on_sent(stepped)

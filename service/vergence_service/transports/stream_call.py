@@ -295,7 +295,7 @@ class DepthCall:
         self._owed += 1
         self._overran = self._overran or self._owed > self._most_unanswered
         receiving_s = frame.nbytes * _RECEIVING_S_PER_BYTE
-        self._engine.turns.charge(stream.key, stream.owner, receiving_s)
+        self._engine.turns.charge(stream.key, receiving_s)
         rig = stream.rectifier.rig
         try:
             codec.check_frame(
