@@ -54,7 +54,7 @@ async def test_the_next_job_is_the_oldest_of_the_highest_priority() -> None:
             assert (await ended(client, job["id"]))["state"] == "done"
 
 
-async def test_announced_uploads_take_room_until_they_expire(tmp_path: Path) -> None:
+async def test_announced_uploads_take_room_while_they_go_on(tmp_path: Path) -> None:
     flags = {"batch__directory": tmp_path, "batch__disk_mib": 1}
     length = {"Tus-Resumable": "1.0.0", "Upload-Length": str(600 << 10)}
     async with http_server(RecallModel(), **flags) as client:
@@ -62,6 +62,10 @@ async def test_announced_uploads_take_room_until_they_expire(tmp_path: Path) -> 
         refused = await client.post("/v1/uploads", headers=length)
         assert reason_of(refused) == "QUEUE_FULL"
         assert "batch.disk_mib" in refused.json()["detail"]
+        [body] = (tmp_path / "uploads").glob("*/body")
+        silent_s = body.stat().st_mtime - 3600
+        os.utime(body, (silent_s, silent_s))
+        assert (await client.post("/v1/uploads", headers=length)).status_code == 201
         never = await client.post("/v1/uploads", headers={**length, "Upload-Length": str(2 << 20)})
         assert reason_of(never) == "UPLOAD_TOO_LARGE"
 

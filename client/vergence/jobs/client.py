@@ -166,6 +166,7 @@ class AsyncBatchClient:
             query={**query, **source, "upload": upload_id},
             headers={"Idempotency-Key": f'"{secrets.token_hex(16)}"'},
             when_full=True,
+            unpacking=True,
         )
         return AsyncBatchJob(self._requests, JobInfo.from_json(answer.json()))
 

@@ -18,7 +18,8 @@ if TYPE_CHECKING:  # an extra
 _CONNECT_S = 10.0
 _SILENT_S = 60.0  # a server answers, or sends a byte, within this time
 _ASK_EVERY_S = 0.5
-_UNAVAILABLE = {429, 503}
+_UNPACKING_S = 3600.0  # a server reads all of an upload before it answers
+_UNAVAILABLE = {409, 429, 503}  # 409: the request before, whose answer was lost, goes on
 
 Query = Mapping[str, Any]
 
@@ -39,13 +40,14 @@ class Requests:
         self._patience_s = patience_s
         self._moved_s = time.monotonic()
         self._lost: type[Exception] = httpx.TransportError
-        timeout = httpx.Timeout(_SILENT_S, connect=_CONNECT_S)
+        self._usual = httpx.Timeout(_SILENT_S, connect=_CONNECT_S)
+        self._unpacking = httpx.Timeout(_UNPACKING_S, connect=_CONNECT_S)
         try:
             self._http = httpx.AsyncClient(
                 base_url=server,
                 headers=dict(credentials.headers),
                 verify=credentials.tls(),
-                timeout=timeout,
+                timeout=self._usual,
                 trust_env=not on_this_machine(server),
             )
         except (ImportError, ValueError) as error:  # a SOCKS proxy without its package, or no URL
@@ -73,8 +75,11 @@ class Requests:
         headers: Mapping[str, str] | None = None,
         body: Callable[[], AsyncIterator[bytes]] | None = None,
         when_full: bool = False,
+        unpacking: bool = False,
     ) -> "httpx.Response":
         """Send a request until it is answered. ``when_full``: also until the server has room.
+
+        ``unpacking``: the answer takes as long as the upload is large.
 
         Raises the class of :mod:`vergence_proto.errors` that the server names, and ConnectionLost.
         """
@@ -85,6 +90,7 @@ class Requests:
                     path,
                     params=query,
                     headers=headers,
+                    timeout=self._unpacking if unpacking else self._usual,
                     content=None if body is None else self._counted(body()),
                 )
             )

@@ -19,6 +19,8 @@ from vergence_proto.errors import UnknownSequence
 from vergence_service.access.principals import Principal
 
 _BODY, _ABOUT = "body", "about.json"
+# An announcement keeps room for so long after the last byte: it costs its client nothing.
+_GOES_ON_S = 600.0
 _UNFINISHED = "."  # the beginning of the name of a folder that is being made
 
 
@@ -70,19 +72,24 @@ class KeptUploads:
         )
 
     def held_bytes(self, besides: str = "", owner: str | None = None) -> int:
-        """Return the space of uploads as announced, without the one of the id ``besides``.
+        """Return the space that uploads take, without the one of the id ``besides``.
 
+        It is what was announced, as long as the upload goes on, and then what has arrived.
         ``owner``: only of uploads of this principal.
         """
         return sum(
-            each.length
+            each.offset + self._missing(each)
             for each in self._all()
             if each.upload_id != besides and owner in (None, each.owner)
         )
 
     def missing_bytes(self) -> int:
-        """Return the space that uploads have announced and do not use yet."""
-        return sum(each.length - each.offset for each in self._all())
+        """Return the space that uploads which go on have announced and do not use yet."""
+        return sum(map(self._missing, self._all()))
+
+    def _missing(self, upload: KeptUpload) -> int:
+        silent_s = time.time() - (upload.expires_s - self._keep_s)
+        return upload.length - upload.offset if silent_s < _GOES_ON_S else 0
 
     def _all(self) -> Iterator[KeptUpload]:
         for folder in self._directory.iterdir() if self._directory.is_dir() else ():
