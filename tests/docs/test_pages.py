@@ -15,6 +15,8 @@ from subprocess import PIPE, Popen
 import pytest
 
 from tests.docs.pages import PAGES, ROOT, blocks_of, commands_of
+from tests.support.short_room import ROOM, link_short_room
+from tests.support.weights_copy import WEIGHTS
 
 # The ports that pages name; each run has a server of its own on free ones.
 _PORTS = {"grpc": "50051", "http": "8000", "zenoh": "7447"}
@@ -24,8 +26,8 @@ _LISTENING = re.compile(
 _PATIENCE_S = 100.0
 _ON_FREE_PORTS = ("--grpc-port", "0", "--http-port", "0")
 _FREE_ENDPOINT = '["tcp/127.0.0.1:0"]'
-SAMPLE = Path("client/vergence/sample/room")
-SAMPLE_FRAMES = 6
+SAMPLE = ROOM.relative_to(ROOT)
+SAMPLE_FRAMES = 3
 
 _EVERYTHING = "vergence serve --zenoh"
 
@@ -34,7 +36,10 @@ Ports = dict[str, str]
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """``vergence`` and ``python`` on the path are those of this checkout."""
+    """``vergence`` and ``python`` on the path are those of this checkout, with a small network.
+
+    ``client`` of the current folder comes first: it has the short sample.
+    """
     binaries = tmp_path_factory.mktemp("bin")
     for name, arguments in {"vergence": "-m vergence.cli", "python": ""}.items():
         command = binaries / name
@@ -43,7 +48,9 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return {
         **os.environ,
         "PATH": f"{binaries}:{os.environ['PATH']}",
-        "PYTHONPATH": os.pathsep.join([*filter(None, sys.path), str(ROOT)]),
+        "PYTHONPATH": os.pathsep.join(["client", *filter(None, sys.path), str(ROOT)]),
+        "VERGENCE_MODEL__WEIGHTS": str(WEIGHTS),
+        "VERGENCE_MODEL__NAME": "whole",
         "VERGENCE_BATCH__DIRECTORY": str(tmp_path_factory.mktemp("jobs")),
         "VERGENCE_ZENOH__LISTEN": _FREE_ENDPOINT,
     }
@@ -73,7 +80,8 @@ def checkout(tmp_path: Path) -> Path:
 
     Its bundled sequence has only the first frames: what the pages do with it takes less time.
     """
-    link_all(ROOT, tmp_path, apart_from=[*SAMPLE.parents, SAMPLE])
+    link_all(ROOT, tmp_path, apart_from=SAMPLE.parents)
+    link_short_room(tmp_path / SAMPLE, frames=SAMPLE_FRAMES)
     return tmp_path
 
 
@@ -81,10 +89,11 @@ def link_all(source: Path, target: Path, *, apart_from: Sequence[Path]) -> None:
     """Link what is in ``source``, but make the folders ``apart_from``, relative to ROOT."""
     target.mkdir(exist_ok=True)
     for entry in source.iterdir():
-        number = re.match(r"frame_(\d+)_", entry.name)
+        if entry == ROOM:
+            continue
         if entry.relative_to(ROOT) in apart_from:
             link_all(entry, target / entry.name, apart_from=apart_from)
-        elif not (entry.name.startswith(".") or (number and int(number[1]) >= SAMPLE_FRAMES)):
+        elif not entry.name.startswith("."):
             (target / entry.name).symlink_to(entry)
 
 
@@ -114,7 +123,15 @@ def test_every_python_block_runs(
     )
 
 
-@pytest.mark.parametrize("page", pages_with("sh"), ids=str)
+# The page of the models evaluates the network that ships, which takes ten seconds.
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=[pytest.mark.slow] * (page.parent.name == "models"))
+        for page in pages_with("sh")
+    ],
+    ids=str,
+)
 def test_every_shell_line_runs(
     page: Path, checkout: Path, environment: dict[str, str], ports: Ports, have_served: set[str]
 ) -> None:

@@ -1,5 +1,9 @@
-"""The commands as a person types them, each in a process of its own, with the weights that ship."""
+"""The commands as a person types them, with the weights that ship.
 
+Most run in the process of the tests: a process of their own would spend a second on its imports.
+"""
+
+import io
 import json
 import os
 import signal
@@ -7,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import chdir, redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import av
@@ -26,26 +31,46 @@ from tests.support.textured_wall import (
     write_wall,
 )
 from tests.support.weights_copy import WEIGHTS
+from vergence.cli.__main__ import main
 from vergence_proto.instruction_set import instruction_set
 
 PATIENCE_S = 60.0
 REPOSITORY = Path(__file__).parents[2]
 
 
+ON_A_TERMINAL = {"COLUMNS": "200", "NO_COLOR": "1"}
+
+
 def vergence(
-    *arguments: object, without: str = "", cwd: Path | None = None, **environment: str
+    *arguments: object, cwd: Path = REPOSITORY, **environment: str
 ) -> subprocess.CompletedProcess[str]:
-    """Run the command; ``without`` is a package that cannot be imported."""
-    hidden = f"sys.modules[{without!r}] = None; " if without else ""
+    """Run the command in this process."""
+    argv = ["vergence", *map(str, arguments)]
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        chdir(cwd),
+        redirect_stdout(out),
+        redirect_stderr(err),
+    ):
+        patch.setattr(sys, "argv", argv)
+        for name, value in {**ON_A_TERMINAL, **environment}.items():
+            patch.setenv(name, value)
+        with pytest.raises(SystemExit) as ended:
+            main()
+    return subprocess.CompletedProcess(argv, ended.value.code or 0, out.getvalue(), err.getvalue())
+
+
+def vergence_without(package: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    """Run the command in a process of its own, where ``package`` cannot be imported."""
     start = "from vergence.cli.__main__ import main; sys.argv[0] = 'vergence'; main()"
-    code = f"import sys; {hidden}{start}"
+    code = f"import sys; sys.modules[{package!r}] = None; {start}"
     return subprocess.run(
         [sys.executable, "-c", code, *map(str, arguments)],
         capture_output=True,
         text=True,
         timeout=PATIENCE_S,
-        cwd=cwd,
-        env={**os.environ, "COLUMNS": "200", "NO_COLOR": "1", **environment},
+        env={**os.environ, **ON_A_TERMINAL},
         check=False,
     )
 
@@ -260,7 +285,7 @@ def test_run_writes_the_maps_and_values_that_are_asked_for(
 def test_what_is_not_installed_is_reported_with_the_extra_that_brings_it(
     missing: str, arguments: list[str], extra: str
 ) -> None:
-    done = vergence(*arguments, without=missing)
+    done = vergence_without(missing, *arguments)
     assert done.returncode == 1
     assert missing in done.stderr
     assert extra in done.stderr
@@ -270,7 +295,9 @@ def test_what_is_not_installed_is_reported_with_the_extra_that_brings_it(
 def test_no_server_to_start_is_reported_with_the_extra_that_brings_it(
     wall: Path, tmp_path: Path
 ) -> None:
-    done = vergence("run", f"vergence:{wall}", without="vergence_service", cwd=tmp_path)
+    done = vergence_without(
+        "vergence_service", "run", f"vergence:{wall}", "--out", tmp_path / "out"
+    )
     assert done.returncode == 1
     assert "vergence[server]" in done.stderr
 
@@ -284,7 +311,7 @@ def test_a_server_that_does_not_start_is_quoted(wall: Path, tmp_path: Path) -> N
 
 
 def test_doctor_finds_the_weights_and_a_running_server(server: str) -> None:
-    done = vergence("doctor", "--server", server)
+    done = vergence("doctor", "--server", server, "--seconds", 1)
     assert done.returncode == 0, done.stdout
     assert "lite" in done.stdout
     assert f"{server} runs" in done.stdout

