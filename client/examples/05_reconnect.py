@@ -7,7 +7,7 @@ Run: ``python client/examples/05_reconnect.py --server grpc://127.0.0.1:50051``
 
 import argparse
 import asyncio
-from contextlib import suppress
+from contextlib import closing, suppress
 from importlib.resources import files
 from itertools import islice
 
@@ -20,11 +20,10 @@ writers: list[asyncio.StreamWriter] = []
 async def pipe(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
     """Forward bytes until one side closes."""
     writers.append(writer)
-    with suppress(ConnectionError):
+    with closing(writer), suppress(ConnectionError):
         while data := await reader.read(1 << 16):
             writer.write(data)
             await writer.drain()
-    writer.close()
 
 
 async def main() -> None:
@@ -38,8 +37,13 @@ async def main() -> None:
         await asyncio.gather(pipe(reader, to_server), pipe(from_server, writer))
 
     room = open_source(f"vergence:{files('vergence') / 'sample' / 'room'}")
-    async with await asyncio.start_server(relay, "127.0.0.1", 0) as relaying:
-        address = f"grpc://127.0.0.1:{relaying.sockets[0].getsockname()[1]}"
+    async with (
+        asyncio.TaskGroup() as tasks,
+        await asyncio.start_server(
+            lambda *ends: tasks.create_task(relay(*ends)), host, 0
+        ) as relaying,
+    ):
+        address = f"grpc://{host}:{relaying.sockets[0].getsockname()[1]}"
         async with vergence.DepthClient(address) as client:
             session = client.open_session(room.rig, on_event=lambda event: print(event.message))
             async with session:
