@@ -37,12 +37,8 @@ async def main() -> None:
         await asyncio.gather(pipe(reader, to_server), pipe(from_server, writer))
 
     room = open_source(f"vergence:{files('vergence') / 'sample' / 'room'}")
-    async with (
-        asyncio.TaskGroup() as tasks,
-        await asyncio.start_server(
-            lambda *ends: tasks.create_task(relay(*ends)), host, 0
-        ) as relaying,
-    ):
+    listening = asyncio.start_server(lambda *ends: tasks.create_task(relay(*ends)), host, 0)
+    async with asyncio.TaskGroup() as tasks, await listening as relaying:
         address = f"grpc://{host}:{relaying.sockets[0].getsockname()[1]}"
         async with vergence.DepthClient(address) as client:
             session = client.open_session(room.rig, on_event=lambda event: print(event.message))
