@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.e2e.test_commands import vergence
+from tests.e2e.test_commands import vergence, vergence_without
 from tests.support.textured_wall import write_wall
 from tests.support.zenoh_net import address_of, free_endpoint
 
@@ -54,6 +54,6 @@ def test_without_the_extra_it_is_said_how_to_install_it() -> None:
         ("serve", "--zenoh", "--grpc-port", 0, "--http-port", 0),
         ("doctor", "--server", "zenoh://127.0.0.1:1"),
     ):
-        done = vergence(*command, without="zenoh")
+        done = vergence_without("zenoh", *command)
         assert done.returncode == 2
         assert "pip install 'vergence[zenoh]'" in done.stderr
