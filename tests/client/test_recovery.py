@@ -290,7 +290,7 @@ async def test_sessions_that_end_with_a_frame_in_flight_end_without_an_error() -
                     await anext(session)
 
         async with DepthClient(server.grpc_address) as client:
-            await asyncio.gather(*(film(client, 20) for _ in range(25)))
+            await asyncio.gather(*(film(client, 5) for _ in range(25)))
         await eventually(lambda: len(server.engine.streams) == 0)
 
 

@@ -54,7 +54,17 @@ def _hear_hangups() -> None:
     signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests themselves may run under nohup
 
 
-def test_no_server_outlives_the_command_that_started_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("SIGTERM", "SIGKILL"),
+        pytest.param(("nohup", "SIGTERM", "SIGHUP", "SIGKILL"), marks=pytest.mark.slow),
+    ],
+    ids=" ".join,
+)
+def test_no_server_outlives_the_command_that_started_it(
+    tmp_path: Path, names: tuple[str, ...]
+) -> None:
     ends = {
         # First: this one ends by itself, after three seconds.
         "nohup": (write_wall(tmp_path / "short", frames=4), 0),
@@ -64,7 +74,8 @@ def test_no_server_outlives_the_command_that_started_it(tmp_path: Path) -> None:
     }
     model = {"VERGENCE_MODEL__WEIGHTS": str(WEIGHTS), "VERGENCE_MODEL__NAME": "whole"}
     commands = {}
-    for name, (source, _) in ends.items():  # all at once: each start takes seconds
+    for name in names:  # all at once: each start takes seconds
+        source, _ = ends[name]
         run = [sys.executable, "-m", "vergence.cli", "run", f"vergence:{source}", "--rate", "1"]
         commands[name] = subprocess.Popen(
             [*run, "--out", str(tmp_path / name)],

@@ -110,7 +110,7 @@ def test_sigma_teaches_neither_disparity_nor_scores() -> None:
 def test_sigma_is_fitted_to_the_spread_of_errors() -> None:
     """Laplace errors, as wide as one of the measures says; the refinement knows nothing."""
     torch.manual_seed(3)
-    measures = torch.randn(40_000, FEATURES) * 2 + 5
+    measures = torch.randn(10_000, FEATURES) * 2 + 5
     wide = measures[:, 1] > 5
     scale = torch.exp((measures[:, 1] - 5) / 2)
     error = scale * torch.empty_like(scale).exponential_()

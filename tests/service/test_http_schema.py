@@ -24,8 +24,6 @@ def as_it_is(context: schemathesis.SerializationContext, content: bytes) -> byte
     return content
 
 
-EXAMPLES = 12  # of every operation
-
 Case = schemathesis.Case[Any]
 
 
@@ -52,14 +50,16 @@ def api() -> Iterator[schemathesis.BaseSchema]:
 
 
 @pytest.mark.parametrize("mode", list(GenerationMode), ids=lambda mode: mode.value)
+@pytest.mark.parametrize("examples", [3, pytest.param(15, marks=pytest.mark.slow)])
 def test_every_operation_answers_as_the_schema_says(
-    api: schemathesis.BaseSchema, mode: GenerationMode
+    api: schemathesis.BaseSchema, mode: GenerationMode, examples: int
 ) -> None:
+    """The examples are of every operation."""
     checked = []
     for operation in (each.ok() for each in api.get_all_operations() if isinstance(each, Ok)):
 
         @given(case=operation.as_strategy(generation_mode=mode))
-        @settings(max_examples=EXAMPLES, deadline=None, suppress_health_check=list(HealthCheck))
+        @settings(max_examples=examples, deadline=None, suppress_health_check=list(HealthCheck))
         def answers(case: Case) -> None:
             # That bytes are a sequence, or images of one size, is more than a schema can say.
             excluded: list[CheckFunction] = []

@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import pytest
+from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, invariant, multiple, rule
 from prometheus_client import CollectorRegistry
@@ -97,6 +98,7 @@ class BudgetMachine(RuleBasedStateMachine):
 
 
 TestBudget = BudgetMachine.TestCase
+TestBudget.settings = settings(stateful_step_count=20)
 
 
 async def test_a_frame_waits_for_the_memory_of_other_frames_but_not_for_ever() -> None:

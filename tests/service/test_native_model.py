@@ -63,7 +63,7 @@ def walk(models: Sequence[StereoModel], *, seed: int = 1, start: int = 1) -> lis
 
 
 @built
-@pytest.mark.parametrize("start", [1, 4, 8])
+@pytest.mark.parametrize("start", [1, 4, pytest.param(8, marks=pytest.mark.slow)])
 def test_a_stream_gets_the_answers_of_onnxruntime(
     native: NativeStereoModel, onnx: OnnxStereoModel, start: int
 ) -> None:

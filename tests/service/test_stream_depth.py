@@ -144,7 +144,11 @@ async def test_a_client_that_does_not_read_is_not_sent_what_is_old_by_then() -> 
 
 @pytest.mark.parametrize(
     ("weights", "name"),
-    [(packaged_weights_dir(), "lite"), (WEIGHTS, "staged")],
+    [
+        # Another test streams these weights too, one client at a time.
+        pytest.param(packaged_weights_dir(), "lite", marks=pytest.mark.slow),
+        (WEIGHTS, "staged"),
+    ],
     ids=["the weights that ship", "side by side"],
 )
 async def test_two_clients_at_once_get_what_each_gets_alone_from_real_graphs(
