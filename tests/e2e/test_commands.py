@@ -58,7 +58,9 @@ def vergence(
             patch.setenv(name, value)
         with pytest.raises(SystemExit) as ended:
             main()
-    return subprocess.CompletedProcess(argv, ended.value.code or 0, out.getvalue(), err.getvalue())
+    code = ended.value.code or 0
+    assert isinstance(code, int), code
+    return subprocess.CompletedProcess(argv, code, out.getvalue(), err.getvalue())
 
 
 def vergence_without(package: str, *arguments: object) -> subprocess.CompletedProcess[str]:

@@ -116,7 +116,7 @@ def test_sigma_is_fitted_to_the_spread_of_errors() -> None:
     error = scale * torch.empty_like(scale).exponential_()
     samples = SigmaSamples(measures, torch.ones(len(error)), error, wide, wide)
     head = SigmaHead()
-    fit_sigma(head, samples, steps=300, seed=1)
+    fit_sigma(head, samples, steps=120, seed=1)
     sigma = predicted(head, measures, samples.sigma)
     for part in (wide, ~wide):
         for sigmas, share in SHARES_PCT.items():

@@ -141,3 +141,11 @@ async def test_a_page_token_of_another_list_is_refused(token: str, tmp_path: Pat
         answer = await client.get("/v1/sequences", params={"state": "done", "page_token": token})
     assert (answer.status_code, reason_of(answer)) == (400, "BAD_SHAPE")
     assert "page_token" in answer.text
+
+
+@pytest.mark.parametrize("number", ["-29168", "1.5", "0"])
+async def test_a_number_is_no_date(number: str, tmp_path: Path) -> None:
+    async with as_ana(tmp_path) as client:
+        answer = await client.get("/v1/sequences", params={"created_after": number})
+    assert answer.status_code == 400
+    assert "expected a date and time" in answer.text

@@ -4,14 +4,22 @@ import base64
 import binascii
 import hashlib
 from datetime import UTC, datetime
+from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from vergence_proto.errors import BadShape
 from vergence_proto.jobs import JobState
 from vergence_service.jobs.job import Job
 
 LABEL = r"^[^:=\s]{1,64}:.{0,200}$"
+
+
+def _no_number(value: object) -> object:
+    """Refuse ``-29168``, which pydantic takes for seconds; the schema allows a date and time."""
+    if isinstance(value, str) and value.lstrip("+-").replace(".", "", 1).isdigit():
+        raise ValueError("expected a date and time, as in 2026-01-31T12:00:00Z")
+    return value
 
 
 class ListQuery(BaseModel):
@@ -22,7 +30,9 @@ class ListQuery(BaseModel):
     state: list[JobState] = Field(default=[], description="only jobs in these states")
     name: str | None = Field(default=None, max_length=200, description="only jobs of this name")
     label: list[str] = Field(default=[], description="only jobs with all these labels, KEY:VALUE")
-    created_after: datetime | None = Field(default=None, description="only jobs created since")
+    created_after: Annotated[datetime, BeforeValidator(_no_number)] | None = Field(
+        default=None, description="only jobs created since"
+    )
     page_size: int = Field(default=100, ge=1, le=1000, description="most jobs of a page")
     page_token: str = Field(
         default="", max_length=200, description="of the link `next` of an earlier page"
