@@ -1,6 +1,6 @@
 """The doctor of recordings: each mistake made in the bundled room is named, and no other."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -8,19 +8,40 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from vergence import source_check
 from vergence.source_check import Advice, Mistake, check_source
 from vergence_proto.datasets import StereoSource, open_source
 from vergence_proto.datasets.poses import interpolated
 from vergence_proto.datasets.source import FrameFiles
 from vergence_proto.geometry import Axes, Pose
-from vergence_proto.types import Intrinsics
+from vergence_proto.types import Image, Intrinsics
 
 ROOM = Path(__file__).parents[2] / "client/vergence/sample/room"
 # Pairs of frames to look at: few, which is quick, but some mistakes show in some motion only.
 PAIRS = 2
 
 Change = Callable[[FrameFiles], FrameFiles]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def features_once() -> Iterator[None]:
+    """The features of an image are found once for all tests: finding them takes nearly all time."""
+    found: dict[tuple[bytes, str, bytes], object] = {}
+    find = vars(source_check)["_features"]
+
+    def found_before(
+        detector: cv2.SIFT, image: Image, camera: Intrinsics, turn: NDArray[np.float64]
+    ) -> object:
+        key = image.tobytes(), repr(camera), turn.tobytes()
+        if key not in found:
+            found[key] = find(detector, image, camera, turn)
+        return found[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(source_check, "_features", found_before)
+        yield
 
 
 @cache
