@@ -4,7 +4,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Literal
 
-Extra = Literal["bench", "cli", "fleet", "models", "record", "server", "train", "zenoh"]
+Extra = Literal["bench", "cli", "fleet", "models", "ray", "record", "server", "train", "zenoh"]
 
 
 def how_to_install(extra: Extra | None) -> str:

@@ -255,6 +255,10 @@ def _batch(
     server: Annotated[
         str | None, typer.Option(help="http://HOST:PORT of a running server; default: start one.")
     ] = None,
+    ray: Annotated[
+        str | None,
+        typer.Option(help="A Ray cluster that does the work: its address, or local."),
+    ] = None,
     out: Annotated[Path, typer.Option(help="Folder for results: OUT/NAME.")] = Path(
         "vergence-batch"
     ),
@@ -279,6 +283,8 @@ def _batch(
     json: JsonOption = None,
 ) -> None:
     """Upload sequences, wait for the server to process them, and download the results."""
+    if ray is not None and server is not None:
+        raise typer.BadParameter("--ray starts servers of its own; leave --server out")
     from vergence.cli.batch import batch
 
     _await(
@@ -296,6 +302,7 @@ def _batch(
             },
             json=json,
             console=_console(),
+            ray=ray,
         )
     )
 

@@ -29,7 +29,7 @@ Query = dict[str, str | int | bool | list[str]]
 # So many are sent at once; the server runs them one after the other.
 _AT_ONCE = 3
 # A server of one's own takes any image; what an archive holds shows only there.
-_LARGEST_PIXELS = 50_000_000
+LARGEST_PIXELS = 50_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +51,7 @@ async def batch(
     query: Query,
     json: Path | None,
     console: Console,
+    ray: str | None = None,
 ) -> None:
     """Upload every sequence at ``paths`` and write its result to OUT/NAME.
 
@@ -66,7 +67,12 @@ async def batch(
         _make_rooms([out / upload.name for upload in waiting])
     outcomes, seconds = [Outcome(upload.name, None, skipped=True) for upload in done], 0.0
     if waiting:
-        sent, seconds = await _send_to(server, waiting, out, form, query, console)
+        if ray is not None:
+            from vergence.cli.ray_batch import batch_on_ray
+
+            sent, seconds = await asyncio.to_thread(batch_on_ray, ray, waiting, out, form, query)
+        else:
+            sent, seconds = await _send_to(server, waiting, out, form, query, console)
         outcomes += sent
     console.print(f"results    {out}")
     console.print(_table(outcomes, seconds))
@@ -105,12 +111,12 @@ async def _send_to(
     console: Console,
 ) -> tuple[list[Outcome], float]:
     if server is not None:
-        return await _send(uploads, server, out, form, query, console)
-    async with local_server(scheme="http", pixels=_LARGEST_PIXELS) as address:
-        return await _send(uploads, address, out, form, query, console)
+        return await send_all(uploads, server, out, form, query, console)
+    async with local_server(scheme="http", pixels=LARGEST_PIXELS) as address:
+        return await send_all(uploads, address, out, form, query, console)
 
 
-async def _send(
+async def send_all(
     uploads: Sequence[NamedUpload],
     server: str,
     out: Path,
@@ -118,6 +124,7 @@ async def _send(
     query: Query,
     console: Console,
 ) -> tuple[list[Outcome], float]:
+    """Make the results of uploads with one server; return their outcomes, and the seconds."""
     started_s = time.monotonic()
     with progress_bar(console) as progress:
         async with AsyncBatchClient(server) as client:
