@@ -12,6 +12,7 @@ from tests.support.sequences import make_frames, write_sequence
 
 pytestmark = pytest.mark.slow  # it needs Ray, and starts a cluster
 SEQUENCES = 8
+MODEL = "sgbm-half"  # it starts at once
 
 
 def maps_of(folder: Path) -> dict[str, bytes]:
@@ -22,13 +23,12 @@ def test_an_actor_is_killed_and_every_result_is_that_of_one_machine(tmp_path: Pa
     for number in range(SEQUENCES):
         frames = make_frames(4, brightness=20 + 5 * number)
         write_sequence(tmp_path / "in" / f"room-{number}", frames)
-    light = {"VERGENCE_MODEL__NAME": "sgbm-half"}
-    one = vergence("batch", tmp_path / "in", "--out", tmp_path / "one", **light)
+    one = vergence("batch", tmp_path / "in", "--out", tmp_path / "one", VERGENCE_MODEL__NAME=MODEL)
     assert one.returncode == 0, one.stderr
     cluster = subprocess.run(
         [sys.executable, "-m", "tests.support.ray_cluster", tmp_path / "in", tmp_path / "ray"],
         cwd=Path(__file__).parents[2],
-        env={**os.environ, **light},
+        env={**os.environ, "VERGENCE_MODEL__NAME": MODEL},
         capture_output=True,
         text=True,
         timeout=240,

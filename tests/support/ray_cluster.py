@@ -9,6 +9,7 @@ import sys
 import threading
 from pathlib import Path
 
+from vergence.cli.batch import Query
 from vergence.cli.ray_batch import batch_on_ray
 from vergence.cli.uploads import find_uploads
 
@@ -31,6 +32,7 @@ def _kill_an_actor(out: Path, done: threading.Event) -> None:
 
 
 def main() -> None:
+    import ray
     from ray.cluster_utils import Cluster
 
     sequences, out = map(Path, sys.argv[1:])
@@ -39,11 +41,12 @@ def main() -> None:
     done = threading.Event()
     killer = threading.Thread(target=_kill_an_actor, args=(out, done))
     killer.start()
-    query = {"output": ["disparity"], "iterations": 0, "quality": "fast", "on_error": "skip"}
+    query: Query = {"output": ["disparity"], "iterations": 0, "quality": "fast", "on_error": "skip"}
     outcomes, _ = batch_on_ray(cluster.address, find_uploads([sequences]), out, "png16", query)
     done.set()
     killer.join()
     print("errors", [each.error for each in outcomes if each.error], flush=True)  # noqa: T201
+    ray.shutdown()
     cluster.shutdown()
 
 
