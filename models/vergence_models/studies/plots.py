@@ -20,6 +20,7 @@ PAGE = "studies"  # file name of the page of all plots that the paper has too
 RUNTIME = "runtime"  # the main table against its times
 
 _SHADES = {"full": "C0", "fast": "C1", "lite": "C2", "SGBM": "0.45"}
+_OTHERS_SHADE = "C4"  # of networks of others
 _PAPER_SHADES = ("0.1", "0.5", "C3")
 # More curves than this are drawn for the main methods only; the table has them all.
 _MOST_CURVES = 9
@@ -65,7 +66,8 @@ class Label:
         """A name for the end of a curve."""
         if self.tier == "SGBM":
             return " ".join(filter(None, [self.tier, self.note]))
-        kind = "every frame cold" if self.cold else "warm"
+        cold = "every frame cold" if self.tier in _SHADES else "cold"  # names of others are long
+        kind = cold if self.cold else "warm"
         return f"{self.tier}, {self.note or kind}"
 
     @property
@@ -109,7 +111,7 @@ def draw(axes: Axes, name: str, table: Table) -> None:
     for curve in curves:
         label = Label.read(curve.label)
         style = "--" if curve.dashed else label.style
-        shade = _SHADES.get(label.tier, "0.45")
+        shade = _SHADES.get(label.tier, _OTHERS_SHADE)
         _plot(axes, curve, style, shade)
         words = f"{label.tier}, cold" if curve.dashed else label.short
         ends.append(End(words, curve.x[-1], curve.epe[-1], shade))
@@ -172,7 +174,7 @@ def _draw_runtime(axes: Axes, table: Table) -> None:
         points.sort()
         curve = Curve(tier, [ms for ms, _, _ in points], [epe for _, epe, _ in points])
         curves.append(curve)
-        shade, marker = _SHADES.get(tier, "0.45"), "s" if cold else "o"
+        shade, marker = _SHADES.get(tier, _OTHERS_SHADE), "s" if cold else "o"
         counted = tier != "SGBM"
         style = "none" if not counted else "--" if cold else "-"
         axes.plot(curve.x, curve.epe, marker, linestyle=style, markersize=4, color=shade)
