@@ -1,11 +1,8 @@
 """The suite runs without torch and Mitsuba: what needs an extra is collected where it is."""
 
 import gc
-import sys
-from collections.abc import Iterator
 from importlib.util import find_spec
 
-import pytest
 from hypothesis import settings
 
 # Wall-clock deadlines judge the machine, not the code. CI looks deeper.
@@ -29,13 +26,3 @@ def pytest_report_header() -> list[str]:
 def pytest_collection_finish() -> None:
     """What collection made stays until the end: the garbage collector need not look at it again."""
     gc.freeze()
-
-
-@pytest.fixture(autouse=True)
-def untraced_if_slow(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Slow tests are left out of coverage, whose tracer would take a fifth of their time."""
-    tracer = sys.gettrace()
-    if request.node.get_closest_marker("slow"):
-        sys.settrace(None)
-    yield
-    sys.settrace(tracer)
