@@ -67,7 +67,7 @@ class Quality(StrEnum):
     STEADY = "steady"
     """A second pass backward in time, fused with the first: less flicker, twice the time."""
     BEST = "best"
-    """The same and a closer look at every frame by itself: fewest errors, ten times the time."""
+    """The same and a closer look at every frame by itself: fewest errors, six times the time."""
 
 
 class OnError(StrEnum):

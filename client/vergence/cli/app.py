@@ -275,7 +275,7 @@ def _batch(
         int, typer.Option(min=0, help="Iterations of a single pair; 0: the server's default.")
     ] = 0,
     quality: Annotated[
-        Quality, typer.Option(help="steady: less flicker, 2 x the time; best: fewer errors, 10 x.")
+        Quality, typer.Option(help="steady: less flicker, 2 x the time; best: fewer errors, 6 x.")
     ] = Quality.FAST,
     metrics: Annotated[
         bool, typer.Option("--metrics", help="Compare with the ground truth, if there is any.")

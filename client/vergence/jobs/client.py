@@ -124,7 +124,7 @@ class AsyncBatchClient:
             Refinement iterations of a single pair; 0: the server's default.
         quality
             "steady": a second pass backward in time for less flicker, at twice the time; "best":
-            also a closer look at every frame, for fewer errors at ten times the time. Both need
+            also a closer look at every frame, for fewer errors at six times the time. Both need
             poses.
         metrics
             Compare with the ground truth of the sequence.

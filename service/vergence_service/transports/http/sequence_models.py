@@ -65,7 +65,7 @@ class OptionsQuery(BaseModel):
     quality: Quality = Field(
         default=Quality.FAST,
         description="steady: a pass backward too, for less flicker at twice the time; best: and a "
-        "closer look at every frame, for fewer errors at ten times the time",
+        "closer look at every frame, for fewer errors at six times the time",
     )
     output: list[JobOutput] = Field(
         default=[JobOutput.DISPARITY],
