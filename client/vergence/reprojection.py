@@ -246,7 +246,7 @@ def _seen_on_grid(maps: Sequence[Projection], view: View, grid: int) -> Found:
     rows, columns = -(-view.height // STEP), -(-view.width // STEP)
     size = (view.height, view.width) if grid == 1 else (rows, columns)
     x, y = (np.arange(length, dtype=np.float32) * grid + (grid - 1) / 2 for length in size[::-1])
-    x, y = x.astype(np.float32)[None, :], y.astype(np.float32)[:, None]
+    x, y = x[None, :], y[:, None]
     seen: Found | None = None
     for source in maps:
         guess = source.splat(rows, columns)

@@ -143,7 +143,7 @@ async def test_a_page_token_of_another_list_is_refused(token: str, tmp_path: Pat
     assert "page_token" in answer.text
 
 
-@pytest.mark.parametrize("number", ["-29168", "1.5", "0"])
+@pytest.mark.parametrize("number", ["-29168", "1.5", "0", "2.4e-105", "+5"])
 async def test_a_number_is_no_date(number: str, tmp_path: Path) -> None:
     async with as_ana(tmp_path) as client:
         answer = await client.get("/v1/sequences", params={"created_after": number})

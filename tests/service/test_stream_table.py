@@ -118,6 +118,20 @@ class StreamTableMachine(RuleBasedStateMachine):
         for table in (self.sizes, self.clients, self.used_s, self.owner, self.streams):
             table.pop(stream_id)
 
+    def next_expiry_s(self, client: str) -> float:
+        """Time until the first stream of an address expires; 1 s if only connections end."""
+        return (
+            min(
+                (
+                    self.used_s[stream_id] + (IDLE_S if self.owner[stream_id] else GRACE_S)
+                    for stream_id, of in self.clients.items()
+                    if of == client
+                ),
+                default=self.clock.now_s + 1.0,
+            )
+            - self.clock.now_s
+        )
+
     def open_in_table(
         self, stream_id: str, size: int, client: str, connection: Connection
     ) -> Stream:
@@ -149,6 +163,8 @@ class StreamTableMachine(RuleBasedStateMachine):
                 self.open_in_table(stream_id, size, client, connection)
             retry_s = refusal.value.retry_after_s
             assert retry_s is None or 0 < retry_s <= IDLE_S
+            if expected is Quota:  # room comes from this address, not from others
+                assert retry_s == pytest.approx(self.next_expiry_s(client))
             return connection
         stream = self.open_in_table(stream_id, size, client, connection)
         self.sizes[stream_id] = size

@@ -11,7 +11,7 @@ import pytest
 
 from tests.support.http import ZIP, ended, http_server, reason_of, submit
 from tests.support.models import RecallModel
-from tests.support.polling import eventually_true
+from tests.support.polling import eventually, eventually_true
 from tests.support.sequences import make_frames, sequence_files, zip_bytes
 from vergence_proto.errors import BadShape
 from vergence_service.jobs.webhooks import WebhookHosts, signature_of
@@ -49,6 +49,24 @@ async def receiver(*statuses: int) -> AsyncIterator[Receiver]:
     receiving.url = f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}/hook?of=ours"
     async with server:
         yield receiving
+
+
+async def test_jobs_that_end_together_are_signed_with_one_secret(tmp_path: Path) -> None:
+    flags = {"batch__directory": tmp_path, "batch__webhook_hosts": ["127.0.0.1"]}
+    async with receiver(*[500] * 50) as receiving:  # so all three are owed when a server starts
+        async with http_server(RecallModel(), **flags) as client:
+            for _ in range(3):
+                await submit(client, ARCHIVE, webhook=receiving.url)
+            await eventually(lambda: len(receiving.received) >= 3)
+        (tmp_path / "webhook_secret").unlink()
+        receiving.received.clear()
+        async with http_server(RecallModel(), **flags):
+            await eventually(lambda: len(receiving.received) >= 3)
+    secret = (tmp_path / "webhook_secret").read_text()
+    for headers, body in receiving.received:
+        sent_s = int(headers["webhook-timestamp"])
+        signature = signature_of(secret, headers["webhook-id"], sent_s, body)
+        assert headers["webhook-signature"] == signature
 
 
 async def test_a_webhook_is_signed_and_sent_until_it_arrives(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import pickle
 import time
 from collections.abc import Sequence
 from contextlib import AsyncExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -83,5 +84,4 @@ def batch_on_ray(
 
 
 def _absolute(upload: NamedUpload) -> NamedUpload:
-    path = upload.upload.path.absolute()
-    return NamedUpload(upload.name, type(upload.upload)(path, upload.upload.source))
+    return replace(upload, upload=replace(upload.upload, path=upload.upload.path.absolute()))

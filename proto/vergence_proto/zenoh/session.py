@@ -23,6 +23,7 @@ from vergence_proto import codec
 from vergence_proto.errors import DepthError, ModelFailed
 from vergence_proto.zenoh.json5_keys import keys_of
 from vergence_proto.zenoh.keys import encoding_of, server_of
+from vergence_proto.zenoh.link_settings import LEASE_MS, WAITS_BEFORE_DROP
 
 Value = TypeVar("Value")
 
@@ -31,19 +32,15 @@ Value = TypeVar("Value")
 _THREADS = 32
 _CLOSE_S = 0.3
 
+_DROP = "transport/link/tx/queue/congestion_control/drop"
+
 _DEFAULTS: dict[str, Any] = {
     # Connect only to configured endpoints.
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
     "scouting/delay": 0,  # no time is spent on finding others
-    # In milliseconds: detect a silent peer after this time. The default is ten seconds.
-    "transport/link/tx/lease": 5000,
-    # In microseconds. Over Wi-Fi, sending a raw pair takes longer than the default of 50 ms, and
-    # every pair would be dropped. The wait for the first part is doubled for each one that follows,
-    # and its default of 1 ms drops the first large frames on a link of 20 Mbit/s. Credit limits how
-    # many wait.
-    "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 100_000,
-    "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": 500_000,
+    "transport/link/tx/lease": LEASE_MS,
+    **{f"{_DROP}/{name}": wait_us for name, wait_us in WAITS_BEFORE_DROP.items()},
     # The default waits seconds between attempts, and a stream must resume within the server's
     # grace period.
     "connect/retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 2},

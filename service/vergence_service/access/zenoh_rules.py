@@ -8,8 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-# As in vergence_proto.zenoh.session.
-_DROP = {"wait_before_drop": 100_000, "max_wait_before_drop_fragments": 500_000}
+from vergence_proto.zenoh.link_settings import LEASE_MS, WAITS_BEFORE_DROP
 
 
 def router_config(
@@ -28,8 +27,8 @@ def router_config(
     """
     link: dict[str, Any] = {
         "tx": {
-            "lease": 5000,
-            "queue": {"congestion_control": {"drop": _DROP}},
+            "lease": LEASE_MS,
+            "queue": {"congestion_control": {"drop": dict(WAITS_BEFORE_DROP)}},
         },
         "rx": {"max_message_size": max_message_bytes},
     }
@@ -68,8 +67,8 @@ def client_config(name: str, password: str) -> dict[str, Any]:
         "transport": {
             "link": {
                 "tx": {
-                    "lease": 5000,
-                    "queue": {"congestion_control": {"drop": _DROP}},
+                    "lease": LEASE_MS,
+                    "queue": {"congestion_control": {"drop": dict(WAITS_BEFORE_DROP)}},
                 }
             },
             "auth": {"usrpwd": {"user": name, "password": password}},

@@ -59,9 +59,9 @@ class StepBatcher:
     """Collects the steps that wait for the model and runs them, oldest first.
 
     Live steps run first. Other steps run in the gaps, in separate batches: first those of the owner
-    that has used the least. A non-live step that
-    would delay a live frame (running or expected soon) waits, at most ``_PATIENCE_S``. Of several
-    lanes, one is never taken by such steps while there are live streams.
+    that has used the least. A non-live step that would delay a live frame (running or expected
+    soon) waits, at most ``_PATIENCE_S``. Of several lanes, one is never taken by such steps while
+    there are live streams.
 
     Steps run side by side only in the memory that ``memory`` has left.
 

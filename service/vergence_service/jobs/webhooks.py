@@ -97,6 +97,7 @@ class WebhookSender:
         self._jobs = jobs
         self._hosts = hosts
         self._secret_file = secret_file
+        self._reading_secret = asyncio.Lock()  # the first reader makes the file
         self._failures: dict[str, int] = {}  # attempts in vain
         self._due_s: dict[str, float] = {}  # of the next attempt
         self._task: asyncio.Task[None] | None = None
@@ -148,9 +149,8 @@ class WebhookSender:
         target = await self._hosts.target(job.webhook)  # its address may be another one by now
         body = message_of(job)
         sent_s = int(time.time())
-        secret = await asyncio.get_running_loop().run_in_executor(
-            None, webhook_secret, self._secret_file
-        )
+        async with self._reading_secret:
+            secret = await asyncio.to_thread(webhook_secret, self._secret_file)
         url = target.url
         path = (url.path or "/") + (f"?{url.query}" if url.query else "")
         headers = {

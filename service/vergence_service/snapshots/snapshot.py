@@ -62,5 +62,5 @@ def digest_of_rig(rig: StereoRig) -> str:
 
 
 def digest_of_token(resume_token: bytes) -> str:
-    """Return what the store keeps of a resume token: whoever reads the store cannot resume."""
+    """Return what the store keeps of a resume token. The token cannot be made from it."""
     return hashlib.sha256(resume_token).hexdigest()

@@ -302,10 +302,6 @@ class DepthEngine:
         stream.failures[error.code] += 1
         self.metrics.frames_failed.labels(error.code).inc()
 
-    def note_sent(self, stepped: SteppedFrame) -> None:
-        """Keep the state after a frame, now that the client has its answer, not before."""
-        self.resumer.save_after(stepped)
-
     async def close(self, stream_id: str, *, owner: str = LOCAL.name) -> None:
         """End a stream and free its state; any connection of its owner may ask for it.
 

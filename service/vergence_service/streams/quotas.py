@@ -1,6 +1,6 @@
 """What one principal, or one address, may hold of a server."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from vergence_proto.errors import Quota
@@ -41,32 +41,41 @@ class Quotas:
         streams: Sequence[Stream],
         others: Sequence[User],
         now_s: float,
+        next_expiry_s: Callable[[Sequence[Stream]], float],
     ) -> None:
         """Raise Quota if another stream would be above a limit of its owner or its address.
 
         ``streams`` are those of the server, ``others`` are places that are taken without one.
+        ``next_expiry_s`` returns when the first of some streams expires, in seconds from now.
         """
         if owner.proven:
             mine = [each for each in streams if each.owner.name == owner.name]
             reserved = [each for each in others if each.owner == owner.name]
-            self._check_count(owner, mine, len(reserved))
-            self._check_memory(owner, need, mine, reserved)
+            room_in_s = next_expiry_s(mine)
+            self._check_count(owner, mine, len(reserved), room_in_s)
+            self._check_memory(owner, need, mine, reserved, room_in_s)
             self._check_pixels(owner, mine, now_s)
-        here = sum(each.client == client for each in streams)
-        here += sum(each.client == client for each in others)
-        if client and self.streams_per_client is not None and here >= self.streams_per_client:
+        if not client or self.streams_per_client is None:
+            return
+        here = [each for each in streams if each.client == client]
+        count = len(here) + sum(each.client == client for each in others)
+        if count >= self.streams_per_client:
             raise Quota(
-                f"{client} has {here} open streams, the limit per client; close one, or "
-                "try again later (the server's setting limits.streams_per_client)"
+                f"{client} has {count} open streams, the limit per client; close one, or "
+                "try again later (the server's setting limits.streams_per_client)",
+                retry_after_s=next_expiry_s(here),
             )
 
-    def _check_count(self, owner: Principal, mine: Sequence[Stream], reserved: int) -> None:
+    def _check_count(
+        self, owner: Principal, mine: Sequence[Stream], reserved: int, room_in_s: float
+    ) -> None:
         count = len(mine) + reserved
         most = owner.streams or self.streams
         if most is not None and count >= most:
             raise Quota(
                 f"{owner.name} has {count} open streams{_named(mine)}, the limit of one principal; "
-                "close one, or try again later (the server's setting limits.streams)"
+                "close one, or try again later (the server's setting limits.streams)",
+                retry_after_s=room_in_s,
             )
 
     def _check_memory(
@@ -75,6 +84,7 @@ class Quotas:
         need: StreamMemory,
         mine: Sequence[Stream],
         reserved: Sequence[User],
+        room_in_s: float,
     ) -> None:
         held = sum(each.memory.nbytes for each in mine) + sum(each.nbytes for each in reserved)
         if self.state_bytes is not None and held + need.own > self.state_bytes:
@@ -82,7 +92,8 @@ class Quotas:
                 f"{owner.name} holds {held / _MIB:.1f} MiB{_named(mine)}, and the stream needs "
                 f"{need.own / _MIB:.1f} MiB more; the limit of one principal is "
                 f"{self.state_bytes / _MIB:.0f} MiB; close a stream, or send smaller images (the "
-                "server's setting limits.state_mib)"
+                "server's setting limits.state_mib)",
+                retry_after_s=room_in_s,
             )
 
     def _check_pixels(self, owner: Principal, mine: Sequence[Stream], now_s: float) -> None:
@@ -107,8 +118,9 @@ def megapixels_per_s(stream: Stream, now_s: float) -> float:
 
 def _named(streams: Sequence[Stream]) -> str:
     """Return the largest streams in words."""
-    largest = sorted(streams, key=lambda each: -each.memory.nbytes)[:_NAMED]
-    names = [f"{each.stream_id} {each.rectifier.rig.width}x{each.rectifier.rig.height}"
-             for each in largest]  # fmt: skip
+    names = []
+    for stream in sorted(streams, key=lambda each: -each.memory.nbytes)[:_NAMED]:
+        rig = stream.rectifier.rig
+        names.append(f"{stream.stream_id} {rig.width}x{rig.height}")
     more = ", ..." if len(streams) > _NAMED else ""
     return f" ({', '.join(names)}{more})" if names else ""

@@ -118,21 +118,19 @@ class StreamResumer:
                 token_digest=digest_of_token(resume_token),
                 rig_digest=digest_of_rig(config.rig),
             )
-            if local is not None and (isinstance(found, Claim) or _is_newer(local, found[1])):
-                if not isinstance(found, Claim) and local.saver is not None:
-                    local.saver.owner = found[0]
-                return attach()
-            match found:
-                case Claim.WRONG_TOKEN:
+            if isinstance(found, Claim):
+                if local is None and found is Claim.WRONG_TOKEN:
                     raise StreamExists(f"stream {stream_id!r} is open, and the token is wrong")
-                case Claim.OTHER_RIG:
+                if local is None and found is Claim.OTHER_RIG:
                     raise BadCalibration(
                         f"stream {stream_id!r} was opened with another rig; open a new stream"
                     )
-                case Claim():
-                    return attach()  # raises the reason why the stream is gone
-                case (store_owner, snapshot):
-                    pass
+                return attach()  # or raises the reason why the stream is gone
+            store_owner, snapshot = found
+            if local is not None and local.last_frame_id > snapshot.last_frame_id:
+                if local.saver is not None:
+                    local.saver.owner = store_owner
+                return attach()
             if snapshot.weights_sha256 != self._weights_sha256:
                 raise ModelChanged(
                     f"the state of stream {stream_id!r} belongs to weights "
@@ -169,10 +167,6 @@ class StreamResumer:
             stream.attachment.end(
                 Superseded(f"another server has taken stream {stream.stream_id!r} over")
             )
-
-
-def _is_newer(local: Stream, snapshot: StreamSnapshot) -> bool:
-    return local.last_frame_id > snapshot.last_frame_id
 
 
 def _restore(stream: Stream, snapshot: StreamSnapshot) -> None:

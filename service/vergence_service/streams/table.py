@@ -11,7 +11,6 @@ import numpy as np
 
 from vergence_proto.errors import (
     BadCalibration,
-    Quota,
     StateMemory,
     StreamExists,
     StreamExpired,
@@ -129,16 +128,15 @@ class StreamTable:
                 "another id"
             )
         others = [*self._leaving.values(), *self._opening.values()]
-        streams = list(self._streams.values())
-        try:
-            self._quotas.check(
-                owner, client, need, streams=streams, others=others, now_s=self._clock()
-            )
-        except Quota as error:
-            if error.retry_after_s is None:
-                theirs = [each for each in streams if owner.name == each.owner.name]
-                error.retry_after_s = self._next_expiry_s(theirs)
-            raise
+        self._quotas.check(
+            owner,
+            client,
+            need,
+            streams=list(self._streams.values()),
+            others=others,
+            now_s=self._clock(),
+            next_expiry_s=self._next_expiry_s,
+        )
         if len(self._streams) + len(others) >= self.capacity:
             raise StreamLimit(
                 f"the server has {self.capacity} open streams, its limit; close one, or "

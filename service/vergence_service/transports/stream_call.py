@@ -90,7 +90,7 @@ class DepthCall:
             metrics=engine.metrics,
             threads=engine.threads.live,
             on_encoded=engine.turns.charge,
-            on_sent=engine.note_sent,
+            on_sent=engine.resumer.save_after,  # not before the client has its answer
         )
         self._displaced = DisplacedFrames(self._outbox, on_reported=self._answered)
         self._reader: asyncio.Task[None] | None = None

@@ -16,10 +16,12 @@ LABEL = r"^[^:=\s]{1,64}:.{0,200}$"
 
 
 def _no_number(value: object) -> object:
-    """Refuse ``-29168``, which pydantic takes for seconds; the schema allows a date and time."""
-    if isinstance(value, str) and value.lstrip("+-").replace(".", "", 1).isdigit():
-        raise ValueError("expected a date and time, as in 2026-01-31T12:00:00Z")
-    return value
+    """Refuse a number, which pydantic takes for seconds; the schema allows a date and time."""
+    try:
+        float(str(value))
+    except ValueError:
+        return value
+    raise ValueError("expected a date and time, as in 2026-01-31T12:00:00Z")
 
 
 class ListQuery(BaseModel):

@@ -39,9 +39,7 @@ def wants_part(request: Request, tag: str) -> bool:
 
     Several parts at once are not answered apart: the answer is then the whole.
     """
-    asked = _RANGE.fullmatch(request.headers.get("range", "").replace(" ", ""))
-    known = request.headers.get("if-range", tag)
-    return asked is not None and asked[0] != "bytes=-" and known == tag
+    return _range_of(request, tag) is not None
 
 
 def part_for(request: Request, total: int, tag: str) -> Part:
@@ -49,8 +47,8 @@ def part_for(request: Request, total: int, tag: str) -> Part:
 
     Raises HTTPException 416: it is past the end.
     """
-    asked = _RANGE.fullmatch(request.headers.get("range", "").replace(" ", ""))
-    if asked is None or not wants_part(request, tag):
+    asked = _range_of(request, tag)
+    if asked is None:
         return Part(0, total, total)
     first, last = asked.groups()
     start = int(first) if first else max(total - int(last), 0)
@@ -62,6 +60,13 @@ def part_for(request: Request, total: int, tag: str) -> Part:
             {"Content-Range": f"bytes */{total}"},
         )
     return Part(start, stop, total)
+
+
+def _range_of(request: Request, tag: str) -> re.Match[str] | None:
+    asked = _RANGE.fullmatch(request.headers.get("range", "").replace(" ", ""))
+    if asked is None or asked[0] == "bytes=-" or request.headers.get("if-range", tag) != tag:
+        return None
+    return asked
 
 
 def has_already(request: Request, tag: str) -> bool:
