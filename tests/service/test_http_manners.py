@@ -143,9 +143,12 @@ async def test_a_page_token_of_another_list_is_refused(token: str, tmp_path: Pat
     assert "page_token" in answer.text
 
 
-@pytest.mark.parametrize("number", ["-29168", "1.5", "0", "2.4e-105", "+5"])
-async def test_a_number_is_no_date(number: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "other",
+    ["-29168", "1.5", "2.4e-105", "2026-01-31", "2026-01-31T12:00:00", "2026-01-31T12:00Z", "now"],
+)
+async def test_what_is_no_date_and_time_is_refused(other: str, tmp_path: Path) -> None:
     async with as_ana(tmp_path) as client:
-        answer = await client.get("/v1/sequences", params={"created_after": number})
+        answer = await client.get("/v1/sequences", params={"created_after": other})
     assert answer.status_code == 400
     assert "expected a date and time" in answer.text

@@ -107,7 +107,10 @@ class JobQueue:
         self.inputs = FolderInputs(limits.inputs)
         self._webhook_hosts = WebhookHosts(limits.webhook_hosts)
         self._webhooks = WebhookSender(
-            self.jobs, self._webhook_hosts, secret_file=store.directory / "webhook_secret"
+            self.jobs,
+            self._webhook_hosts,
+            secret_file=store.directory / "webhook_secret",
+            background=self.threads,
         )
         # Owner and client of the jobs that are being added.
         self._accepting: list[tuple[str, str]] = []

@@ -28,6 +28,7 @@ from urllib.parse import SplitResult, urlsplit
 from vergence_proto.errors import BadShape
 from vergence_service.jobs.job import Job
 from vergence_service.jobs.registry import JobRegistry
+from vergence_service.threads import ThreadPool
 
 log = logging.getLogger(__name__)
 
@@ -93,10 +94,13 @@ class WebhookHosts:
 class WebhookSender:
     """Sends the webhooks of ended jobs, those of earlier servers too, between start and stop."""
 
-    def __init__(self, jobs: JobRegistry, hosts: WebhookHosts, *, secret_file: Path) -> None:
+    def __init__(
+        self, jobs: JobRegistry, hosts: WebhookHosts, *, secret_file: Path, background: ThreadPool
+    ) -> None:
         self._jobs = jobs
         self._hosts = hosts
         self._secret_file = secret_file
+        self._background = background
         self._reading_secret = asyncio.Lock()  # the first reader makes the file
         self._failures: dict[str, int] = {}  # attempts in vain
         self._due_s: dict[str, float] = {}  # of the next attempt
@@ -150,7 +154,7 @@ class WebhookSender:
         body = message_of(job)
         sent_s = int(time.time())
         async with self._reading_secret:
-            secret = await asyncio.to_thread(webhook_secret, self._secret_file)
+            secret = await self._background.run(webhook_secret, self._secret_file)
         url = target.url
         path = (url.path or "/") + (f"?{url.query}" if url.query else "")
         headers = {

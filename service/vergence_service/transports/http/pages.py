@@ -3,7 +3,8 @@
 import base64
 import binascii
 import hashlib
-from datetime import UTC, datetime
+import re
+from datetime import datetime
 from typing import Annotated
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
@@ -15,13 +16,14 @@ from vergence_service.jobs.job import Job
 LABEL = r"^[^:=\s]{1,64}:.{0,200}$"
 
 
-def _no_number(value: object) -> object:
-    """Refuse a number, which pydantic takes for seconds; the schema allows a date and time."""
-    try:
-        float(str(value))
-    except ValueError:
-        return value
-    raise ValueError("expected a date and time, as in 2026-01-31T12:00:00Z")
+# RFC 3339, section 5.6. pydantic alone would take numbers for seconds, and days without a time.
+_DATE_TIME = re.compile(r"\d{4}-\d\d-\d\d[Tt]\d\d:\d\d:\d\d(\.\d+)?([Zz]|[+-]\d\d:\d\d)", re.ASCII)
+
+
+def _date_time(value: object) -> object:
+    if not _DATE_TIME.fullmatch(str(value)):
+        raise ValueError("expected a date and time with its zone, as in 2026-01-31T12:00:00Z")
+    return value
 
 
 class ListQuery(BaseModel):
@@ -32,7 +34,7 @@ class ListQuery(BaseModel):
     state: list[JobState] = Field(default=[], description="only jobs in these states")
     name: str | None = Field(default=None, max_length=200, description="only jobs of this name")
     label: list[str] = Field(default=[], description="only jobs with all these labels, KEY:VALUE")
-    created_after: Annotated[datetime, BeforeValidator(_no_number)] | None = Field(
+    created_after: Annotated[datetime, BeforeValidator(_date_time)] | None = Field(
         default=None, description="only jobs created since"
     )
     page_size: int = Field(default=100, ge=1, le=1000, description="most jobs of a page")
@@ -49,11 +51,7 @@ class ListQuery(BaseModel):
         theirs = {f"{key}:{value}" for key, value in job.labels.items()}
         if not theirs.issuperset(self.label):
             return False
-        after = self.created_after
-        if after is None:
-            return True
-        since = after if after.tzinfo else after.replace(tzinfo=UTC)
-        return job.created_s >= since.timestamp()
+        return self.created_after is None or job.created_s >= self.created_after.timestamp()
 
     def below(self) -> int | None:
         """Return where the page begins. Raises BadShape: the token is of another list."""
