@@ -3,7 +3,7 @@
 import asyncio
 import socket
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any, Self
 
@@ -80,11 +80,26 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
 
 
 class _Uvicorn(uvicorn.Server):
-    """A uvicorn server that does not handle signals: the process does."""
+    """A uvicorn server that ends when it is told to. Signals are left to the process."""
+
+    def __init__(self, config: uvicorn.Config) -> None:
+        super().__init__(config)
+        self._told = asyncio.Event()
+
+    def end(self, *, within_s: float) -> None:
+        self.config.timeout_graceful_shutdown = within_s  # type: ignore[assignment] # takes fractions
+        self.should_exit = True
+        self._told.set()
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
         yield
+
+    async def main_loop(self) -> None:
+        # uvicorn's own looks ten times a second whether it should end.
+        while not await self.on_tick(0):  # 0: it renews the header `date`
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self._told.wait(), 1.0)
 
 
 class HttpServer:
@@ -147,6 +162,5 @@ class HttpServer:
     async def _finish(self, *, within_s: float) -> None:
         """Accept no more requests, and wait for the answers that are being sent."""
         self._stopping.set()
-        self._server.config.timeout_graceful_shutdown = within_s  # type: ignore[assignment] # takes fractions
-        self._server.should_exit = True
+        self._server.end(within_s=within_s)
         await self._task
