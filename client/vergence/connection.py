@@ -155,11 +155,8 @@ class StreamConnection:
         lost = talk.result() if beside is None else ConnectionLost("the server fell silent")
         if lost is None:
             return None
-        if self._ending and not self._listener.awaited:
-            # Nothing is lost: the server drops the stream by itself.
-            if beside is not None:
-                await beside.close()
-            return None
+        if self._ending and not self._listener.awaited and beside is None:
+            return None  # the server will drop the stream by itself
         return await self._reattach(lost, beside)
 
     async def _talk(self, call: Call) -> DepthError | None:

@@ -53,7 +53,7 @@ async def test_a_client_that_has_its_share_is_refused_and_leaves_room_to_others(
         # A share is an address's, by whatever door; to come back to what one has takes no other.
         async with DepthClient(f"http://{server.http_address}") as same:
             with pytest.raises(Quota, match=r"127\.0\.0\.1 has 1 open streams"):
-                async with same.open_session(RIG):
+                async with same.open_session(RIG, open_timeout_s=0.1):
                     pass
         token = mine.opened.resume_token
         async with raw_stream(server, "mine", resume_token=token) as again:

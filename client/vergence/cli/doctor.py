@@ -77,7 +77,7 @@ async def examine_link(server: str, seconds: float, console: Console) -> None:
     ages = " / ".join(f"{1e3 * figures.age_s(each):.0f}" for each in (50, 95, 100))
     images = f"JPEG {link.jpeg_quality}, " + ("half size" if link.scale == 2 else "full size")
     rows = {
-        "session opens in": f"{figures.open_s:.2f} s",
+        "session opens in": f"{1e3 * figures.open_s:.0f} ms",
         "round trip": trip,
         "results": f"{figures.results_hz:.1f} per second of {CAMERA_HZ:.0f} filmed",
         "age": f"{ages} ms (median / 95 % / oldest)",
