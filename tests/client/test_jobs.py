@@ -175,6 +175,7 @@ def test_a_folder_is_sent_as_the_same_bytes_from_any_offset(tmp_path: Path) -> N
         assert asyncio.run(sent(start)) == whole[start:], start
 
 
+@pytest.mark.slow
 async def test_a_job_is_followed_through_cut_lines_and_a_restart(tmp_path: Path) -> None:
     folder = write_sequence(tmp_path / "room", make_frames(40))
     jobs = tmp_path / "jobs"

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import httpx
 import numpy as np
+import pytest
 from rich.console import Console
 
 from tests.support.http import (
@@ -63,6 +64,7 @@ async def killed_server(
         await process.wait()
 
 
+@pytest.mark.slow
 async def test_a_killed_server_finishes_all_that_it_accepted(tmp_path: Path) -> None:
     # Steps are so slow that the server is killed in the middle of a sequence.
     async with killed_server(tmp_path, step_s=0.04) as client:

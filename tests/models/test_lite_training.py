@@ -68,6 +68,7 @@ def test_likelihood_counts_known_truth_alone() -> None:
     assert Hypotheses(surfaces, scores).unlikelihood(truth + 9, 192, scale=4) > 0
 
 
+@pytest.mark.slow
 def test_each_part_is_measured_beside_the_whole(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

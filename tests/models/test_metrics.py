@@ -99,6 +99,7 @@ def test_holes_take_the_farther_side() -> None:
     assert filled(row).tolist() == [[5, 5, 3, 3, 3, 3], [0, 0, 0, 0, 0, 0]]
 
 
+@pytest.mark.slow
 def test_the_command_reports_every_method(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

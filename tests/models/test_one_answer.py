@@ -69,6 +69,7 @@ def test_the_answer_is_the_one_that_another_cpu_recorded(found: Maps) -> None:
     assert agreeing(maps[0], maps[1]) < SHARE  # the tolerance separates two frames
 
 
+@pytest.mark.slow
 def test_sums_in_32_bits_change_no_answer(
     footage: Footage, found: Maps, monkeypatch: pytest.MonkeyPatch
 ) -> None:

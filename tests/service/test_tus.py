@@ -162,6 +162,7 @@ class CuttingProxy:
                 await end.wait_closed()
 
 
+@pytest.mark.slow
 async def test_a_transfer_that_is_cut_again_and_again_sends_only_the_cut_parts_twice(
     tmp_path: Path,
 ) -> None:
