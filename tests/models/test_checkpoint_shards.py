@@ -51,6 +51,7 @@ def trained(clips: StereoClips, steps: int) -> Trainer:
     return trainer
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_from_pieces_elsewhere(
     in_pieces: int, clips: StereoClips, tmp_path: Path
 ) -> None:

@@ -178,6 +178,7 @@ class Clamped(nn.Module):
         return columns.clamp(0, columns.shape[1] - 1) + 0.5
 
 
+@pytest.mark.slow
 def test_a_clamp_to_a_size_is_one_operator(tmp_path: Path) -> None:
     path = tmp_path / "clamped.onnx"
     export_part(

@@ -126,6 +126,7 @@ def test_a_step_has_the_losses_that_were_recorded() -> None:
     assert losses == pytest.approx([0.49101, 0.64195, 0.67347, 0.44615], rel=5e-3)
 
 
+@pytest.mark.slow
 def test_training_lowers_the_loss(pool: Path) -> None:
     trainer = Trainer(SMALL, torch.device("cpu"))
     clips = ClipPool(pool).clips([0])
@@ -209,6 +210,7 @@ def test_noise_of_poses_stays_small_and_rigid() -> None:
     assert 0 < (noisy - poses).abs().max() < 0.02
 
 
+@pytest.mark.slow
 def test_batches_depend_on_the_step_alone_whoever_makes_them(pool: Path) -> None:
     def first_two(first_step: int, workers: int) -> list[torch.Tensor]:
         with closing(

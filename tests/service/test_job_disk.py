@@ -61,7 +61,7 @@ def full(means: str, folder: Path) -> Iterator[None]:
         yield
 
 
-@pytest.mark.parametrize("means", ["tmpfs", "rlimit"])
+@pytest.mark.parametrize("means", [pytest.param("tmpfs", marks=pytest.mark.slow), "rlimit"])
 async def test_a_job_waits_while_the_disk_is_full_and_loses_nothing(
     means: str, tmp_path: Path
 ) -> None:

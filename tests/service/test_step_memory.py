@@ -36,6 +36,7 @@ print(json.dumps([resident("VmHWM") - before, most]))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_steps_of_many_sizes_take_no_more_memory_than_the_largest_is_said_to_take() -> None:
     done = subprocess.run(
