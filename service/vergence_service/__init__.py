@@ -3,3 +3,9 @@
 Read the packages from the bottom up: ``inference`` (the model), ``streams`` (states and the
 engine), ``jobs`` (uploaded sequences), ``transports`` (gRPC, HTTP, Zenoh), ``app`` (composition).
 """
+
+import os
+
+# onnxruntime reads it when it is imported. Without it, the Linux wheels from 1.29 on send names and
+# hashes of models, and facts about the machine, to Microsoft.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")

@@ -117,6 +117,16 @@ def test_demo_ends_with_a_picture_a_video_and_a_table(wall: Path, tmp_path: Path
         assert sum(1 for _ in film.decode(video=0)) == 3
 
 
+def test_demo_with_a_running_server_needs_no_other(wall: Path, server: str, tmp_path: Path) -> None:
+    done = vergence_without(
+        "vergence_service",
+        *("demo", "--server", server, "--source", f"vergence:{wall}", "--frames", 2),
+        *("--out", tmp_path / "pictures", "--json", tmp_path / "figures.json"),
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "figures.json").read_text())["frames"] == 2
+
+
 def test_run_writes_every_frame_losslessly(wall: Path, server: str, tmp_path: Path) -> None:
     done = vergence(
         *("run", f"vergence:{wall}", "--server", server, "--out", tmp_path / "out"),
@@ -227,9 +237,10 @@ def test_run_at_a_rate_accounts_for_every_frame(server: str, tmp_path: Path) -> 
         (["run", "WALL", "--server", "http://x"], 2, "expected a server as grpc://HOST:PORT"),
         (["run", "WALL", "--server", "127.0.0.1:1"], 1, "no connection to 127.0.0.1:1"),
         (["run", "WALL", "--out", "/dev/null/here"], 1, "/dev/null/here"),
+        (["demo", "--server", "127.0.0.1:1"], 1, "no connection to 127.0.0.1:1"),
         (["demo", "--source", "kitti:here"], 2, "expected KITTI's camera projections"),
     ],
-    ids=["kind", "folder", "rate", "scheme", "nobody-there", "unwritable", "demo"],
+    ids=["kind", "folder", "rate", "scheme", "nobody-there", "unwritable", "demo-alone", "demo"],
 )
 def test_what_a_person_got_wrong_is_reported_without_a_trace(
     wall: Path, tmp_path: Path, arguments: list[str], code: int, expected: str

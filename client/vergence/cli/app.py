@@ -104,14 +104,15 @@ def _demo(
     source: Annotated[
         str | None, typer.Option(help="KIND:PATH of other data than the sample.")
     ] = None,
+    server: ServerOption = None,
     out: Annotated[Path, typer.Option(help="Folder for the pictures.")] = Path("vergence-demo"),
     json: JsonOption = None,
 ) -> None:
-    """Start a server, stream a sample through it, and draw the result."""
+    """Start a server, or use a running one; stream a sample through it, and draw the result."""
     from vergence.cli.demo import bundled_sample, demo
 
     text = source or bundled_sample()
-    _await(demo(text, frames=frames, out=out, json=json, console=_console()))
+    _await(demo(text, server=server, frames=frames, out=out, json=json, console=_console()))
 
 
 @app.command(

@@ -18,6 +18,7 @@ from vergence.cli.report import Report
 from vergence.cli.sources import source_at
 from vergence.cli.streaming import AnsweredFrame, every_frame
 from vergence.client import DepthClient
+from vergence.session import DepthSession
 from vergence_proto.datasets import SourceFrame
 from vergence_proto.film import CannotFilm
 from vergence_proto.geometry import RectifiedRig
@@ -32,28 +33,33 @@ def bundled_sample() -> str:
 
 
 async def demo(
-    source_text: str, *, frames: int | None, out: Path, json: Path | None, console: Console
+    source_text: str,
+    *,
+    server: str | None,
+    frames: int | None,
+    out: Path,
+    json: Path | None,
+    console: Console,
 ) -> None:
-    """Stream a source losslessly through a server started here; show and save the results."""
+    """Stream a source losslessly; show and save the results. ``server``: None: start one."""
     source = source_at(source_text)
     # Read before the clock starts: a camera does not decode files.
     filmed = list(source)[:frames]
     report = Report()
+    pixels = source.rig.left.width * source.rig.left.height
     async with (
-        server_for(None, console, pixels=source.rig.left.width * source.rig.left.height) as server,
-        DepthClient(server) as client,
-        client.open_session(source.rig, delivery=Delivery.EVERY, output=WITH_SIGMA) as session,
+        server_for(server, console, pixels=pixels) as address,
+        DepthClient(address) as client,
     ):
-        rig = session.rig if source.metric else None
-        title = title_of(source.name, source.rig, session.model.name)
-        answers: list[AnsweredFrame] = []
-        with progress_bar(console) as progress:
-            bar = progress.add_task("streaming", total=len(filmed), note="")
+        if server is not None:
+            await client.server_info()  # a session would wait for a server that is not there
+        async with client.open_session(
+            source.rig, delivery=Delivery.EVERY, output=WITH_SIGMA
+        ) as session:
+            rig = session.rig if source.metric else None
+            title = title_of(source.name, source.rig, session.model.name)
             started_s = time.monotonic()
-            async with aclosing(every_frame(session, _as_read(filmed), in_flight=1)) as stream:
-                async for answered in stream:
-                    answers.append(answered)
-                    progress.update(bar, advance=1, note=f"{1e3 * answered.latency_s:.0f} ms")
+            answers = await _stream(session, filmed, console)
             report.seconds = time.monotonic() - started_s
     for answered in answers:
         report.add(answered.latency_s, answered.result.timings.model_s, answered.accuracy())
@@ -62,6 +68,19 @@ async def demo(
     console.print(report.as_table(title))
     if json is not None:
         write_json(json, report.as_json())
+
+
+async def _stream(
+    session: DepthSession, frames: Sequence[SourceFrame], console: Console
+) -> list[AnsweredFrame]:
+    answers: list[AnsweredFrame] = []
+    with progress_bar(console) as progress:
+        bar = progress.add_task("streaming", total=len(frames), note="")
+        async with aclosing(every_frame(session, _as_read(frames), in_flight=1)) as stream:
+            async for answered in stream:
+                answers.append(answered)
+                progress.update(bar, advance=1, note=f"{1e3 * answered.latency_s:.0f} ms")
+    return answers
 
 
 async def _as_read(frames: Sequence[SourceFrame]) -> AsyncIterator[tuple[int, SourceFrame]]:

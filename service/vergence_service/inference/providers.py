@@ -55,6 +55,8 @@ def start_session(
         options.add_session_config_entry("session.use_env_allocators", "1")
         # A pattern is one more buffer, as large as the peak of a step, for each size of image.
         options.enable_mem_pattern = False
+    elif providers[0] in {PROVIDERS[name] for name in _DEVICES}:
+        _load_cuda()
     options.log_severity_level = 4  # fatal: what is less is raised
     session = onnxruntime.InferenceSession(graph, options, providers=list(providers))
     # onnxruntime falls back to the CPU with a warning. A server must not do so silently.
@@ -64,6 +66,12 @@ def start_session(
             "the reason (usually a missing driver or library)"
         )
     return session
+
+
+@cache
+def _load_cuda() -> None:
+    """Load the libraries of NVIDIA's wheels, once per process: the linker does not look there."""
+    onnxruntime.preload_dlls()
 
 
 @cache
