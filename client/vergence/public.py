@@ -6,9 +6,10 @@ from vergence.errors import NotOpen, WrongDelivery
 from vergence.filters import keep_confident, keep_range, without_speckles
 from vergence.info import ModelInfo, ServerInfo, StreamInfo
 from vergence.jobs.blocking import BatchClient, BatchJob
-from vergence.jobs.client import AsyncBatchClient, AsyncBatchJob
+from vergence.jobs.client import AsyncBatchClient
 from vergence.jobs.frames import BatchFrame
 from vergence.jobs.info import JobInfo
+from vergence.jobs.job import AsyncBatchJob
 from vergence.link import LinkState
 from vergence.one_pair import depth
 from vergence.reprojection import DepthView, View, reproject

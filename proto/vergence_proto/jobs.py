@@ -90,6 +90,8 @@ class WarningKind(StrEnum):
     """The calibration is not known, so depth is not in metres."""
     UNREADABLE = "unreadable"
     """Images are missing or damaged."""
+    QUALITY = "quality"
+    """The quality that was asked for changes nothing for this sequence or model."""
     DATA = "data"
     """What is missing in the upload or does not fit."""
 

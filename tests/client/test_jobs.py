@@ -25,6 +25,7 @@ from vergence import (
     ConnectionLost,
     JobState,
     NonFinite,
+    SequenceNotDone,
     UnknownSequence,
 )
 from vergence.jobs.packing import find_upload
@@ -128,6 +129,23 @@ def test_a_result_is_saved_in_any_layout_and_replaced_by_the_next(
     job.delete()
     with pytest.raises(UnknownSequence):
         job.refresh()
+
+
+def test_a_job_runs_again_on_the_input_it_has_kept(serving: Serving, tmp_path: Path) -> None:
+    client = BatchClient(serving.address)
+    folder = write_sequence(tmp_path / "room", FRAMES)
+    job = client.submit(
+        folder, outputs=["sigma"], labels={"robot": "r2"}, priority="high", keep_input=True
+    )
+    job.wait()
+    again = job.rerun(quality="steady", priority="low")
+    assert again.id != job.id
+    assert again.info.labels == {"robot": "r2"}
+    frames = list(again.frames())
+    assert all(frame.sigma_px is not None for frame in frames)
+    assert again.manifest()["options"]["quality"] == "steady"
+    with pytest.raises(SequenceNotDone, match="keep_input"):
+        again.rerun()
 
 
 def test_frames_without_a_map_and_failed_jobs_say_why(serving: Serving, tmp_path: Path) -> None:

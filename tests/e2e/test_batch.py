@@ -2,6 +2,7 @@
 
 import io
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,9 @@ from vergence.cli.batch import batch
 from vergence.cli.errors import CliError
 
 
-async def run(paths: list[Path], server: str, out: Path, **query: Any) -> dict[str, Any]:
+async def run(
+    paths: list[Path], server: str, out: Path, *, again: Sequence[str] = (), **query: Any
+) -> dict[str, Any]:
     await batch(
         paths,
         server=server,
@@ -29,6 +32,7 @@ async def run(paths: list[Path], server: str, out: Path, **query: Any) -> dict[s
         query=query,
         json=out / "batch.json",
         console=Console(file=io.StringIO()),
+        again=again,
     )
     figures: dict[str, Any] = json.loads((out / "batch.json").read_text())
     return figures
@@ -61,6 +65,23 @@ async def test_what_was_collected_takes_no_room_on_the_server(tmp_path: Path) ->
     async with http_server(RecallModel(), batch__directory=jobs) as client:
         await run([room], str(client.base_url), tmp_path / "out")
         assert list((jobs / "jobs").iterdir()) == []
+
+
+async def test_a_job_that_was_kept_runs_again_without_an_upload(tmp_path: Path) -> None:
+    room = write_sequence(tmp_path / "room", make_frames(3))
+    out = tmp_path / "out"
+    async with http_server(RecallModel(), batch__directory=tmp_path / "jobs") as client:
+        server = str(client.base_url)
+        await run([room], server, out, keep_input=True, priority="low")
+        kept = json.loads((out / "room" / "manifest.json").read_text())["id"]
+        room.rename(tmp_path / "gone")
+        await run([], server, out, again=[kept], keep_input=False)
+        assert (await client.get(f"/v1/sequences/{kept}")).json()["state"] == "done"
+    for index in range(3):
+        first, second = (
+            np.load(out / name / f"{index:04d}.npz")["disparity"] for name in ("room", kept)
+        )
+        np.testing.assert_array_equal(first, second)
 
 
 async def test_one_failure_does_not_stop_the_others_and_is_reported(tmp_path: Path) -> None:

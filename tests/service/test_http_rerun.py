@@ -22,9 +22,14 @@ async def test_a_job_that_kept_its_input_runs_again_with_other_options(tmp_path:
         await ended(client, other["id"])
         await ended(client, job["id"])
         url = f"/v1/sequences/{job['id']}/rerun"
-        again = await client.post(url, params={"quality": "steady"})
+        key = {"Idempotency-Key": '"once"'}
+        again = await client.post(url, params={"quality": "steady"}, headers=key)
         assert again.status_code == httpx.codes.ACCEPTED, again.text
         first = again.json()
+        repeated = await client.post(url, params={"quality": "steady"}, headers=key)
+        assert repeated.json()["id"] == first["id"]
+        other_options = await client.post(url, params={"quality": "best"}, headers=key)
+        assert reason_of(other_options) == "KEY_REUSED"
         assert (first["quality"], first["metrics"]) == ("steady", True)
         assert first["labels"] == {"robot": "r2"}
         second = (await client.post(url)).json()

@@ -1,7 +1,6 @@
 """A model without memory is served as every other one, and nothing claims that it remembers."""
 
 import asyncio
-from functools import partial
 
 import numpy as np
 import pytest
@@ -19,6 +18,7 @@ from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.inference.model import Step, StereoView
 from vergence_service.inference.onnx_model import OnnxStereoModel
 from vergence_service.inference.snapshots import state_from_bytes, state_to_bytes
+from vergence_service.streams.conversion import decoded_view
 from vergence_service.streams.stream import StreamConfig
 
 
@@ -84,6 +84,9 @@ async def test_sessions_and_jobs_over_every_transport_agree(model: OnnxStereoMod
             job = await submit(web, zip_bytes(sequence_files(frames)))
             assert (await ended(web, job["id"]))["state"] == "done"
             of_the_job = await disparities(web, job["id"])
+            assert job["warnings"] == []
+            more = await submit(web, zip_bytes(sequence_files(frames)), quality="steady")
+            assert [each["kind"] for each in more["warnings"]] == ["quality"]
     for mine, same, kept in zip(over_grpc, over_http, of_the_job, strict=True):
         np.testing.assert_array_equal(mine.disparity_px, same.disparity_px)
         np.testing.assert_array_equal(kept, as_kept(mine.disparity_px))
@@ -95,14 +98,14 @@ async def test_a_sequence_that_goes_on_after_a_crash_does_not_claim_a_state(
     config = StreamConfig(StereoRig.from_rectified(RIG))
     async with running_server(model) as server:
         async with server.engine.offline(config) as stream:
-            whole = [
-                await server.engine.step_offline(stream, partial(make_frame, i)) for i in (1, 2)
-            ]
-        kept = state_from_bytes(state_to_bytes(whole[0][1]))
+            first = decoded_view(lambda: make_frame(1), stream)
+            before = await server.engine.step_view(stream, *first)
+            whole = await server.engine.step_offline(stream, make_frame(2))
+        kept = state_from_bytes(state_to_bytes(before.result.state))
         async with server.engine.offline(config, state=kept) as stream:
-            after, _ = await server.engine.step_offline(stream, lambda: make_frame(2))
+            after = await server.engine.step_offline(stream, make_frame(2))
     assert (after.origin, after.step_count) == (Origin.COLD_START, 1)
-    np.testing.assert_array_equal(after.disparity_px, whole[1][0].disparity_px)
+    np.testing.assert_array_equal(after.disparity_px, whole.disparity_px)
 
 
 def test_rows_of_a_batch_are_what_each_gets_alone_on_any_device(model: OnnxStereoModel) -> None:

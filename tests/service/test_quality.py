@@ -43,6 +43,17 @@ async def test_more_passes_are_the_mean_of_the_maps_that_agree() -> None:
     np.testing.assert_allclose(best[1:][clear], expected[clear], atol=2 * STORED_PX)
 
 
+async def test_a_quality_that_changes_nothing_is_said_at_once() -> None:
+    single = zip_bytes(sequence_files(FRAMES[:1]))
+    async with http_server(RecallModel()) as client:
+        for archive, why in ((ALONE, "no frame has a pose"), (single, "one frame")):
+            job = await submit(client, archive, quality="best")
+            said = {each["kind"]: each["message"] for each in job["warnings"]}
+            assert why in said["quality"]
+        useful = await submit(client, ARCHIVE, quality="best")
+        assert useful["warnings"] == []
+
+
 class StopsOnce(RecallModel):
     """It stays in one step until it is let go."""
 

@@ -24,7 +24,15 @@ from vergence.cli.options import (
 from vergence.transports.addresses import DEFAULT_SERVER
 from vergence.transports.credentials import use_files
 from vergence_proto.errors import DepthError
-from vergence_proto.jobs import MAP_FORMATS, JobOutput, OnError, Output, Quality, ResultFormat
+from vergence_proto.jobs import (
+    MAP_FORMATS,
+    JobOutput,
+    JobPriority,
+    OnError,
+    Output,
+    Quality,
+    ResultFormat,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -251,10 +259,14 @@ def _record(
 @app.command("batch")
 def _batch(
     paths: Annotated[
-        list[Path], typer.Argument(help="Archives, or folders in a supported layout.")
-    ],
+        list[Path] | None, typer.Argument(help="Archives, or folders in a supported layout.")
+    ] = None,
     server: Annotated[
         str | None, typer.Option(help="http://HOST:PORT of a running server; default: start one.")
+    ] = None,
+    rerun: Annotated[
+        list[str] | None,
+        typer.Option(help="Id of a job of the server that has kept its input; may be repeated."),
     ] = None,
     ray: Annotated[
         str | None,
@@ -281,16 +293,26 @@ def _batch(
     metrics: Annotated[
         bool, typer.Option("--metrics", help="Compare with the ground truth, if there is any.")
     ] = False,
+    priority: Annotated[
+        JobPriority, typer.Option(help="Which of the waiting jobs of the server is next.")
+    ] = JobPriority.NORMAL,
+    keep_input: Annotated[
+        bool, typer.Option("--keep-input", help="Keep job and input on the server, for --rerun.")
+    ] = False,
     json: JsonOption = None,
 ) -> None:
     """Upload sequences, wait for the server to process them, and download the results."""
     if ray is not None and server is not None:
         raise typer.BadParameter("--ray starts servers of its own; leave --server out")
+    if (rerun or keep_input) and server is None:
+        raise typer.BadParameter("--rerun and --keep-input need the --server that keeps the jobs")
+    if not paths and not rerun:
+        raise typer.BadParameter("name at least one archive or folder, or a job with --rerun")
     from vergence.cli.batch import batch
 
     _await(
         batch(
-            paths,
+            paths or [],
             server=server,
             out=out,
             form=form,
@@ -300,7 +322,10 @@ def _batch(
                 "quality": quality.value,
                 "metrics": metrics,
                 "on_error": on_error.value,
+                "priority": priority.value,
+                "keep_input": keep_input,
             },
+            again=rerun or [],
             json=json,
             console=_console(),
             ray=ray,

@@ -17,8 +17,9 @@ from vergence.cli.json_file import write_json
 from vergence.cli.local_server import local_server
 from vergence.cli.progress import progress_bar
 from vergence.cli.uploads import NamedUpload, find_uploads
-from vergence.jobs.client import AsyncBatchClient, AsyncBatchJob
+from vergence.jobs.client import AsyncBatchClient
 from vergence.jobs.info import JobInfo
+from vergence.jobs.job import AsyncBatchJob
 from vergence.jobs.saving import is_finished, make_room
 from vergence.transports.base import ConnectionLost
 from vergence_proto.errors import DepthError, SequenceNotDone
@@ -42,6 +43,13 @@ class Outcome:
     skipped: bool = False  # its result was there already
 
 
+@dataclass(frozen=True, slots=True)
+class KeptJob:
+    """A job of the server whose kept input is to be stepped again."""
+
+    name: str
+
+
 async def batch(
     paths: Sequence[Path],
     *,
@@ -52,14 +60,18 @@ async def batch(
     json: Path | None,
     console: Console,
     ray: str | None = None,
+    again: Sequence[str] = (),
 ) -> None:
     """Upload every sequence at ``paths`` and write its result to OUT/NAME.
+
+    ``again``: ids of jobs that have kept their input. They are run again, and the name of a result
+    is the id.
 
     Raises CliError: there is nothing to send, no server, or (at the end) some sequences failed.
     """
     uploads = find_uploads(list(paths))
     done: list[NamedUpload] = []
-    waiting: list[NamedUpload] = []
+    waiting: list[NamedUpload | KeptJob] = [KeptJob(job_id) for job_id in again]
     for upload in uploads:
         there = await asyncio.to_thread(_is_there, upload, out, form, query)
         (done if there else waiting).append(upload)
@@ -70,7 +82,8 @@ async def batch(
         if ray is not None:
             from vergence.cli.ray_batch import batch_on_ray
 
-            sent, seconds = await asyncio.to_thread(batch_on_ray, ray, waiting, out, form, query)
+            named = [each for each in waiting if isinstance(each, NamedUpload)]
+            sent, seconds = await asyncio.to_thread(batch_on_ray, ray, named, out, form, query)
         else:
             sent, seconds = await _send_to(server, waiting, out, form, query, console)
         outcomes += sent
@@ -79,6 +92,8 @@ async def batch(
     for each in outcomes:
         for note in dict.fromkeys([*each.job.warnings, *each.job.notes] if each.job else ()):
             console.print(f"[yellow]note[/]       {each.name}: {note}", soft_wrap=True)
+        if each.job and query.get("keep_input"):
+            console.print(f"kept       {each.name}: job {each.job.id}", soft_wrap=True)
     if json is not None:
         write_json(json, _figures(outcomes, seconds))
     failed = [outcome for outcome in outcomes if outcome.error]
@@ -104,7 +119,7 @@ def _make_rooms(folders: Sequence[Path]) -> None:
 
 async def _send_to(
     server: str | None,
-    uploads: Sequence[NamedUpload],
+    uploads: Sequence[NamedUpload | KeptJob],
     out: Path,
     form: str,
     query: Query,
@@ -117,7 +132,7 @@ async def _send_to(
 
 
 async def send_all(
-    uploads: Sequence[NamedUpload],
+    uploads: Sequence[NamedUpload | KeptJob],
     server: str,
     out: Path,
     form: str,
@@ -130,14 +145,15 @@ async def send_all(
         async with AsyncBatchClient(server) as client:
             places = asyncio.Semaphore(_AT_ONCE)
 
-            async def one(upload: NamedUpload) -> Outcome:
+            async def one(upload: NamedUpload | KeptJob) -> Outcome:
                 async with places:
                     bar = progress.add_task(upload.name, total=None, note="uploading")
                     job: AsyncBatchJob | None = None
                     try:
-                        job = await client.send(upload.upload, query)
+                        job = await _submit(client, upload, query)
                         await _fetch(job, form, out / upload.name, progress, bar)
-                        await job.delete()
+                        if not query.get("keep_input"):
+                            await job.delete()
                         return Outcome(upload.name, job.info)
                     except DepthError as error:
                         info = job.info if job else None
@@ -150,6 +166,14 @@ async def send_all(
 
             outcomes = await asyncio.gather(*map(one, uploads))
     return outcomes, time.monotonic() - started_s
+
+
+async def _submit(
+    client: AsyncBatchClient, each: NamedUpload | KeptJob, query: Query
+) -> AsyncBatchJob:
+    if isinstance(each, KeptJob):
+        return await (await client.job(each.name)).rerun_with(query)
+    return await client.send(each.upload, query)
 
 
 async def _fetch(

@@ -11,16 +11,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from vergence.jobs.client import (
-    DEFAULT_SERVER,
-    AsyncBatchClient,
-    AsyncBatchJob,
-    Format,
-    Output,
-    Source,
-)
+from vergence.jobs.client import DEFAULT_SERVER, AsyncBatchClient, Source
 from vergence.jobs.frames import BatchFrame
 from vergence.jobs.info import JobInfo
+from vergence.jobs.job import AsyncBatchJob, Format, Output, Priority
 from vergence_proto.geometry import RectifiedRig
 from vergence_proto.jobs import JobState
 
@@ -62,6 +56,8 @@ class BatchClient:
         iterations: int = 0,
         quality: Literal["fast", "steady", "best"] = "fast",
         metrics: bool = False,
+        priority: Priority = "normal",
+        keep_input: bool = False,
         webhook: str = "",
         rig: RectifiedRig | None = None,
         fps: float = 30.0,
@@ -78,6 +74,8 @@ class BatchClient:
                 iterations=iterations,
                 quality=quality,
                 metrics=metrics,
+                priority=priority,
+                keep_input=keep_input,
                 webhook=webhook,
                 rig=rig,
                 fps=fps,
@@ -136,6 +134,37 @@ class BatchJob:
     def cancel(self) -> JobInfo:
         """Stop the job; the frames that are done stay."""
         return self._run(lambda job: job.cancel())
+
+    def rerun(
+        self,
+        *,
+        outputs: Sequence[Output] | None = None,
+        on_error: Literal["skip", "fail"] | None = None,
+        quality: Literal["fast", "steady", "best"] | None = None,
+        metrics: bool | None = None,
+        name: str = "",
+        labels: Mapping[str, str] | None = None,
+        priority: Priority = "normal",
+        keep_input: bool = False,
+        webhook: str = "",
+    ) -> "BatchJob":
+        """Submit the sequence of this job again; see :meth:`AsyncBatchJob.rerun`."""
+
+        async def rerun(job: AsyncBatchJob) -> JobInfo:
+            again = await job.rerun(
+                outputs=outputs,
+                on_error=on_error,
+                quality=quality,
+                metrics=metrics,
+                name=name,
+                labels=labels,
+                priority=priority,
+                keep_input=keep_input,
+                webhook=webhook,
+            )
+            return again.info
+
+        return BatchJob(self._client, self._run(rerun))
 
     def delete(self) -> None:
         """Delete the job and its files on the server."""

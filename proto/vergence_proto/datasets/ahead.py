@@ -15,6 +15,7 @@ async def read_ahead(
     *,
     start: int = 0,
     on_unreadable: Callable[[int, DatasetError], None] | None = None,
+    on_read: Callable[[int, SourceFrame], None] = lambda index, frame: None,
     in_thread: Callable[[Callable[[], _Read]], Awaitable[_Read]] = asyncio.to_thread,
 ) -> AsyncGenerator[tuple[int, SourceFrame], None]:
     """Yield index and frame from ``start`` on; decode the next frame while one is in use.
@@ -22,9 +23,17 @@ async def read_ahead(
     Decoding runs in a thread, by ``in_thread``. If a file is missing or damaged, ``on_unreadable``
     gets the frame's index and the error. A frame without its truth is yielded all the same; a frame
     that lacks an image is left out. Without ``on_unreadable``, raises DatasetError.
+
+    ``on_read`` is called in the thread, with each frame that was read.
     """
 
     def read(index: int) -> _Read:
+        found = decode(index)
+        if found[0] is not None:
+            on_read(index, found[0])
+        return found
+
+    def decode(index: int) -> _Read:
         try:
             return source[index], None
         except DatasetError as error:

@@ -30,15 +30,23 @@ class Forecast:
 
 
 def forecast(
-    sequence: StereoSource, folder: Path, limits: ContinuityLimits, unreadable: Sequence[str]
+    sequence: StereoSource,
+    folder: Path,
+    limits: ContinuityLimits,
+    unreadable: Sequence[str],
+    *,
+    recurrent: bool,
 ) -> Forecast:
     """Find the frames that will start cold, and what else a user should know now.
 
-    ``unreadable`` are the reasons why images below ``folder`` cannot be read.
+    ``unreadable`` are the reasons why images below ``folder`` cannot be read. Every frame is a cold
+    start for a model that is not ``recurrent``: nobody needs a warning of that.
     """
     cold = _cold_frames(sequence.files, limits)
     warnings: list[JobWarning] = []
-    if len(sequence) > 1 and all(each.world_from_left is None for each in sequence.files):
+    if not recurrent:
+        pass
+    elif len(sequence) > 1 and all(each.world_from_left is None for each in sequence.files):
         warnings.append(
             JobWarning(
                 WarningKind.NO_POSES,

@@ -7,8 +7,9 @@ its first maps need not wait for the last frame.
 """
 
 import dataclasses
-from collections.abc import AsyncGenerator, Callable, Sequence
+from collections.abc import AsyncGenerator, Callable
 from contextlib import aclosing
+from functools import partial
 from pathlib import Path
 
 from vergence_proto.datasets import DatasetError, StereoSource
@@ -16,6 +17,7 @@ from vergence_proto.errors import DepthError, NonFinite
 from vergence_proto.job_results.frame_file import SUFFIX, decode_frame, encode_frame
 from vergence_proto.job_results.records import FrameRecord
 from vergence_proto.jobs import Quality
+from vergence_proto.model_io import ModelCard
 from vergence_proto.types import DisparityMap
 from vergence_service.inference.model import RecurrentState
 from vergence_service.jobs.fusion import fused
@@ -49,7 +51,7 @@ async def step_passes(
 
     Raises what :func:`step_all` raises.
     """
-    if quality is Quality.FAST or not _has_poses(sequence) or not engine.card.recurrent:
+    if quality is Quality.FAST or why_no_passes(sequence, engine.card) is not None:
         async with aclosing(
             step_all(
                 engine,
@@ -90,7 +92,9 @@ async def step_passes(
                 async for step in steps:
                     if isinstance(step, Stepped):
                         state = step.state
-                        yield await background.run(_with_others, step, scratch)
+                        backward = await background.run(_read, _path(scratch, step.index))
+                        made = partial(_fused, step, backward)
+                        yield dataclasses.replace(step, make_map=made, make_alone=None)
                         continue
                     if isinstance(step.error, NonFinite):
                         state = None
@@ -120,7 +124,7 @@ async def _step_backward(
         index = last - step.index
         if index < end:
             record = FrameRecord(index=index, left="", right="", capture_ns=0)
-            content = encode_frame(record, step.disparity, sigma=True)
+            content = encode_frame(record, step.make_map(), sigma=True)
             _path(scratch, index).write_bytes(content)
 
     stepping = step_all(engine, backward, config, may_skip=may_skip, owner=owner)
@@ -141,19 +145,28 @@ def _backward(sequence: StereoSource, first: int, last: int) -> StereoSource:
     return dataclasses.replace(sequence, files=files)
 
 
-def _with_others(step: Stepped, scratch: Path) -> Stepped:
-    others: list[DisparityMap] = [] if step.alone is None else [step.alone]
-    path = _path(scratch, step.index)
-    if path.is_file():
-        backward = decode_frame(path.read_bytes(), step.rectifier.rig).disparity
-        others += [] if backward is None else [backward]
-    return dataclasses.replace(step, disparity=fused(step.disparity, others), alone=None)
+def _read(path: Path) -> bytes | None:
+    return path.read_bytes() if path.is_file() else None
+
+
+def _fused(step: Stepped, backward: bytes | None) -> DisparityMap:
+    others = [] if step.make_alone is None else [step.make_alone()]
+    if backward is not None:
+        found = decode_frame(backward, step.rectifier.rig).disparity
+        others += [] if found is None else [found]
+    return fused(step.make_map(), others)
 
 
 def _path(scratch: Path, index: int) -> Path:
     return scratch / f"{index:06d}{SUFFIX}"
 
 
-def _has_poses(sequence: StereoSource) -> bool:
-    files: Sequence[object] = [each.world_from_left for each in sequence.files]
-    return len(files) > 1 and any(each is not None for each in files)
+def why_no_passes(sequence: StereoSource, card: ModelCard) -> str | None:
+    """Return why more passes would change nothing, or None if they help."""
+    if not card.recurrent:
+        return f"the model {card.name} has no memory from frame to frame"
+    if len(sequence) == 1:
+        return "the sequence is one frame"
+    if all(each.world_from_left is None for each in sequence.files):
+        return "no frame has a pose"
+    return None

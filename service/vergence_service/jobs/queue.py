@@ -18,13 +18,13 @@ from vergence_proto.errors import (
     Quota,
     SequenceNotDone,
 )
-from vergence_proto.jobs import JobOutput, JobPriority, OnError, Quality
+from vergence_proto.jobs import JobOutput, JobPriority, OnError, Quality, WarningKind
 from vergence_service.access.principals import LOCAL, Principal
 from vergence_service.jobs.folder_inputs import FolderInputs
 from vergence_service.jobs.forecast import forecast
-from vergence_service.jobs.job import Job, JobOptions
+from vergence_service.jobs.job import Job, JobOptions, JobWarning
 from vergence_service.jobs.kept_uploads import KeptUploads
-from vergence_service.jobs.passes import BLOCK
+from vergence_service.jobs.passes import BLOCK, why_no_passes
 from vergence_service.jobs.progress import JobStatus
 from vergence_service.jobs.registry import JobRegistry
 from vergence_service.jobs.results import read_records, result_bytes
@@ -217,8 +217,19 @@ class JobQueue:
         if unreadable and options.on_error is OnError.FAIL:
             raise BadSequence(unreadable[0])
         found = await self.threads.run(
-            forecast, sequence, upload, self._engine.continuity, unreadable
+            forecast,
+            sequence,
+            upload,
+            self._engine.continuity,
+            unreadable,
+            recurrent=self._engine.card.recurrent,
         )
+        warnings = found.warnings
+        if options.quality is not Quality.FAST and (
+            why := why_no_passes(sequence, self._engine.card)
+        ):
+            text = f"quality={options.quality} changes nothing, since {why}"
+            warnings = (JobWarning(WarningKind.QUALITY, text), *warnings)
         uploaded = await self.threads.run(folder_bytes, folder)
         result = result_bytes(sequence, options.outputs)
         if options.quality is not Quality.FAST:
@@ -242,7 +253,7 @@ class JobQueue:
             key_fingerprint=order.key_fingerprint,
             options=options,
             upload_sha256=upload_sha256,
-            warnings=found.warnings,
+            warnings=warnings,
             cold_expected=found.cold_frames,
             megapixels=sequence.rig.left.width * sequence.rig.left.height / 1e6,
             disk_bytes=uploaded + result,

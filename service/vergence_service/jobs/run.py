@@ -18,7 +18,7 @@ from vergence_proto.job_results.frame_file import encode_frame
 from vergence_proto.job_results.records import FrameRecord
 from vergence_proto.jobs import JobOutput, OnError
 from vergence_proto.ordered import in_order
-from vergence_proto.types import Delivery, OutputFormat
+from vergence_proto.types import Delivery, DisparityMap, OutputFormat
 from vergence_service.jobs.checkpoints import Checkpoint, read_checkpoint, write_checkpoint
 from vergence_service.jobs.job import Job, JobOptions
 from vergence_service.jobs.left_image import left_image
@@ -224,13 +224,14 @@ class _Writer:
             record = dataclasses.replace(record, error=self._words(step.error))
             write_frame(self.result, step.index, encode_frame(record, None))
             return record
-        record = self._described(record, step)
+        disparity = step.make_map()
+        record = self._described(record, step, disparity)
         left = None
         if JobOutput.LEFT in self._outputs:
             left = left_image(step.rectifier, files.left, step.source.frame.left)
         content = encode_frame(
             record,
-            step.disparity,
+            disparity,
             confidence=JobOutput.CONFIDENCE in self._outputs,
             sigma=JobOutput.SIGMA in self._outputs,
             left=left,
@@ -238,8 +239,10 @@ class _Writer:
         write_frame(self.result, step.index, content)
         return record
 
-    def _described(self, record: FrameRecord, step: Stepped) -> FrameRecord:
-        disparity, source = step.disparity, step.source
+    def _described(
+        self, record: FrameRecord, step: Stepped, disparity: DisparityMap
+    ) -> FrameRecord:
+        source = step.source
         measured = None
         if source.truth_px is not None:
             found = accuracy(disparity.offset_px, source.truth_px, source.truth_mask)

@@ -12,7 +12,8 @@ from vergence_proto.errors import BadShape, DepthError, NonFinite
 from vergence_proto.ordered import in_order
 from vergence_proto.types import DisparityMap, Origin
 from vergence_service.access.principals import LOCAL
-from vergence_service.inference.model import RecurrentState
+from vergence_service.inference.model import RecurrentState, StereoView
+from vergence_service.streams.conversion import decoded_view
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.rectify import Rectifier
 from vergence_service.streams.stream import Stream, StreamConfig
@@ -29,11 +30,11 @@ class Stepped:
 
     index: int  # position in the sequence, from 0
     source: SourceFrame
-    disparity: DisparityMap
+    make_map: Callable[[], DisparityMap]  # works on whole images: call it in a worker thread
     state: RecurrentState  # state after this frame
     rectifier: Rectifier
     note: DatasetError | None = None  # what is wrong with its ground truth
-    alone: DisparityMap | None = None  # the map without a state, if it was asked for
+    make_alone: Callable[[], DisparityMap] | None = None  # the map without a state, if asked for
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,6 +49,7 @@ class Skipped:
 class _Read:
     index: int
     source: SourceFrame
+    view: StereoView | DepthError
     note: DatasetError | None
 
 
@@ -74,7 +76,7 @@ async def step_all(
     """
     async with (
         engine.offline(config, state=state, owner=owner) as stream,
-        aclosing(_reading(engine, sequence, start, may_skip)) as frames,
+        aclosing(_reading(engine, sequence, stream, start, may_skip)) as frames,
         aclosing(
             in_order(frames, partial(_step, engine, stream, may_skip, alone), limit=_IN_FLIGHT)
         ) as (steps),
@@ -86,10 +88,18 @@ async def step_all(
 async def _reading(
     engine: DepthEngine,
     sequence: StereoSource,
+    stream: Stream,
     start: int,
     may_skip: Callable[[DatasetError | DepthError], bool],
 ) -> AsyncGenerator[_Read | Skipped, None]:
     errors: dict[int, DatasetError] = {}
+    views: dict[int, StereoView | DepthError] = {}
+
+    def make_view(index: int, source: SourceFrame) -> None:
+        try:
+            _, views[index] = decoded_view(lambda: source.frame, stream)
+        except DepthError as error:
+            views[index] = error
 
     def note(index: int, error: DatasetError) -> None:
         if not may_skip(error):
@@ -97,14 +107,18 @@ async def _reading(
         errors[index] = error
 
     reading = read_ahead(
-        sequence, start=start, in_thread=engine.threads.background.run, on_unreadable=note
+        sequence,
+        start=start,
+        in_thread=engine.threads.background.run,
+        on_unreadable=note,
+        on_read=make_view,
     )
     async with aclosing(reading) as frames:
         async for index, source in frames:
             own = errors.pop(index, None)
             for missing in sorted(errors):
                 yield Skipped(missing, errors.pop(missing))
-            yield _Read(index, source, own)
+            yield _Read(index, source, views.pop(index), own)
     for missing in sorted(errors):
         yield Skipped(missing, errors[missing])
 
@@ -118,19 +132,33 @@ async def _step(
 ) -> Stepped | Skipped:
     if isinstance(read, Skipped):
         return read
+    frame_id = read.source.frame.frame_id
     try:
-        disparity, state = await engine.step_offline(stream, lambda: read.source.frame)
-        second = await _alone(engine, stream, read) if alone and state.step_count > 1 else None
+        if isinstance(read.view, DepthError):
+            engine.count_failed(stream, read.view)
+            raise read.view
+        stepped = await engine.step_view(stream, frame_id, read.view)
+        state, second = stepped.result.state, None
+        if alone and state.step_count > 1:
+            second = await engine.step_view(_without_state(stream), frame_id, read.view)
     except FRAME_ERRORS as error:
         if not may_skip(error):
             raise
         return Skipped(read.index, error)
-    return Stepped(read.index, read.source, disparity, state, stream.rectifier, read.note, second)
+    return Stepped(
+        read.index,
+        read.source,
+        stepped.disparity_map,
+        state,
+        stream.rectifier,
+        read.note,
+        None if second is None else second.disparity_map,
+    )
 
 
-async def _alone(engine: DepthEngine, stream: Stream, read: _Read) -> DisparityMap:
-    """Step a frame as if it were the first."""
-    first = dataclasses.replace(
+def _without_state(stream: Stream) -> Stream:
+    """Return a stream whose next frame is stepped as if it were the first."""
+    return dataclasses.replace(
         stream,
         state=None,
         origin=Origin.COLD_START,
@@ -138,5 +166,3 @@ async def _alone(engine: DepthEngine, stream: Stream, read: _Read) -> DisparityM
         frames_skipped=0,
         turn=asyncio.Lock(),
     )
-    disparity, _ = await engine.step_offline(first, lambda: read.source.frame)
-    return disparity

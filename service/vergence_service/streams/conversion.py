@@ -80,12 +80,10 @@ class SteppedFrame:
         )
 
 
-def decoded_view(
-    decode: Callable[[], StereoFrame], stream: Stream
-) -> tuple[StereoFrame, StereoView]:
-    """Decode a frame, and make the view that the model steps. Call it in a worker thread."""
+def decoded_view(decode: Callable[[], StereoFrame], stream: Stream) -> tuple[int, StereoView]:
+    """Decode a frame; return its id and the model's view. Call it in a worker thread."""
     try:
         frame = decode()
-        return frame, view_from_frame(frame, stream.rectifier, stream.config.axes)
+        return frame.frame_id, view_from_frame(frame, stream.rectifier, stream.config.axes)
     except MemoryError:
         raise out_of_memory() from None

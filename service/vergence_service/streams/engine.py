@@ -1,9 +1,10 @@
 """The engine: open a stream, step it frame by frame, close it."""
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
 from enum import Enum
+from functools import partial
 
 from vergence_proto.errors import (
     DepthError,
@@ -23,7 +24,7 @@ from vergence_proto.types import (
 from vergence_service.access.principals import LOCAL, Principal
 from vergence_service.failures import out_of_memory
 from vergence_service.inference.batcher import StepBatcher
-from vergence_service.inference.model import RecurrentState, Step, StereoModel
+from vergence_service.inference.model import RecurrentState, Step, StereoModel, StereoView
 from vergence_service.memory import MemoryBudget, StreamMemory
 from vergence_service.metrics import Metrics
 from vergence_service.snapshots.saver import Snapshots
@@ -37,7 +38,7 @@ from vergence_service.streams.search_window import SearchReach
 from vergence_service.streams.stream import Attachment, Notice, NoticeKind, Stream, StreamConfig
 from vergence_service.streams.table import StreamTable
 from vergence_service.streams.turns import Turns
-from vergence_service.threads import Cost, ThreadPool, Threads
+from vergence_service.threads import Cost, Threads
 
 # A client that comes while the model loads waits for at most this long. It is below the time that
 # the SDK waits for a stream to open, 5 s.
@@ -230,14 +231,10 @@ class DepthEngine:
         """
         stream = self.streams.get(stream_id, owner=owner)
         self.streams.touch(stream)
+        decoded = partial(self.threads.live.run, cost.of, decoded_view, decode, stream)
         try:
             return await self._step(
-                stream,
-                decode,
-                self.threads.live,
-                arrived_s=arrived_s,
-                cost=cost,
-                max_age_s=max_age_s,
+                stream, decoded, arrived_s=arrived_s, cost=cost, max_age_s=max_age_s
             )
         finally:
             self.streams.touch(stream)  # a step may take longer than the idle timeout
@@ -271,17 +268,26 @@ class DepthEngine:
             stream.state, stream.origin, stream.owner = state, origin, Principal(owner)
             yield stream
 
-    async def step_offline(
-        self, stream: Stream, decode: Callable[[], StereoFrame]
-    ) -> tuple[DisparityMap, RecurrentState]:
-        """Advance a stream of :meth:`offline`; return the map and the state after the frame.
+    async def step_view(self, stream: Stream, frame_id: int, view: StereoView) -> SteppedFrame:
+        """Advance a stream of :meth:`offline` by a frame whose view was made in a thread.
 
-        Raises what ``decode`` raises, BadShape or FrameOutOfOrder if the frame is refused,
-        ModelFailed, NonFinite and Draining.
+        Raises FrameOutOfOrder, ModelFailed, NonFinite and Draining.
         """
-        pool, now_s = self.threads.background, self._clock()
-        stepped = await self._step(stream, decode, pool, arrived_s=now_s, cost=Cost())
-        return await pool.run(stepped.disparity_map), stepped.result.state
+
+        async def decoded() -> tuple[int, StereoView]:
+            return frame_id, view
+
+        return await self._step(stream, decoded, arrived_s=self._clock(), cost=Cost())
+
+    async def step_offline(self, stream: Stream, frame: StereoFrame) -> DisparityMap:
+        """Advance a stream of :meth:`offline` by one frame, and return the map.
+
+        Raises BadShape if the images do not fit, and what :meth:`step_view` raises.
+        """
+        pool = self.threads.background
+        frame_id, view = await pool.run(decoded_view, lambda: frame, stream)
+        stepped = await self.step_view(stream, frame_id, view)
+        return await pool.run(stepped.disparity_map)
 
     async def reset(self, stream_id: str, *, owner: str = LOCAL.name) -> None:
         """Let later frames start without a state. Raises UnknownStream, StreamExpired."""
@@ -347,8 +353,7 @@ class DepthEngine:
     async def _step(
         self,
         stream: Stream,
-        decode: Callable[[], StereoFrame],
-        pool: ThreadPool,
+        decoded: Callable[[], Awaitable[tuple[int, StereoView]]],
         *,
         arrived_s: float,
         cost: Cost,
@@ -360,9 +365,9 @@ class DepthEngine:
             try:
                 started_s = self._clock()
                 skipped = stream.frames_skipped
-                frame, view = await pool.run(cost.of, decoded_view, decode, stream)
+                frame_id, view = await decoded()
                 decode_s = self._clock() - started_s
-                stream.check_order(frame.frame_id)
+                stream.check_order(frame_id)
                 state, origin = stream.state_before(view, self.continuity)
                 iterations = self._iterations.of(stream.config, cold=state is None)
                 live = stream.config.delivery is Delivery.NEWEST
@@ -379,14 +384,14 @@ class DepthEngine:
                 if isinstance(error, NonFinite):
                     self._forget(stream, Origin.RESET_NON_FINITE)
                 raise
-            stream.commit(frame.frame_id, result.state, frames_skipped=skipped)
+            stream.commit(frame_id, result.state, frames_skipped=skipped)
         stream.note_answer(self._clock(), arrived_s, origin, iterations, timings.model_s)
         self.metrics.model_s.labels(stream.owner.name).inc(timings.model_s)
         self.metrics.frames_stepped.labels(origin.name.lower()).inc()
         for stage in ("decode", "queue", "model"):
             self.metrics.stage_s.labels(stage).observe(getattr(timings, f"{stage}_s"))
         return SteppedFrame(
-            stream, frame.frame_id, arrived_s, view, result, origin, iterations, skipped, timings
+            stream, frame_id, arrived_s, view, result, origin, iterations, skipped, timings
         )
 
     def _forget(self, stream: Stream, reason: Origin) -> None:

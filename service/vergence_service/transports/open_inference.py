@@ -101,7 +101,7 @@ async def step_pair(engine: DepthEngine, left: Image, right: Image) -> Maps:
     )
     frame = StereoFrame(1, 0, left, right)
     async with engine.offline(config, owner=CALLER.get().name) as stream:
-        found, _ = await engine.step_offline(stream, lambda: frame)
+        found = await engine.step_offline(stream, frame)
     assert found.sigma_px is not None
     # JSON has no NaN: 0 is no value, as in the files of KITTI.
     return {

@@ -164,7 +164,7 @@ def pair_routes(engine: DepthEngine, places: Places, *, limits: UploadLimits) ->
         )
         frame = StereoFrame(1, 0, left, right)
         async with engine.offline(config, owner=CALLER.get().name) as stream:
-            disparity, _ = await engine.step_offline(stream, lambda: frame)
+            disparity = await engine.step_offline(stream, frame)
         return await background.run(_answer, disparity, query, metric=metric)
 
     return router

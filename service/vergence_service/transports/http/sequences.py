@@ -213,7 +213,7 @@ def sequence_routes(
         await queue.check_webhook(query.webhook)
         client, caller = client_of(request), CALLER.get()
         jobs.check_owner(job_id, caller)
-        before = jobs.get(job_id)
+        before, submission = jobs.get(job_id), Submission.of(request, caller)
         order = JobOrder(
             source=before.source,
             input=before.input,
@@ -223,12 +223,18 @@ def sequence_routes(
             webhook=query.webhook,
             name=query.name or before.name,
             labels=query.labels or before.labels,
+            key=submission.key,
+            key_fingerprint=submission.fingerprint,
         )
-        async with queue.upload_folder(client, upload_bytes=0, owner=caller) as folder:
-            await queue.link_input(job_id, folder)
-            status = await queue.accept(
-                folder, order, upload_sha256=before.upload_sha256, client=client, owner=caller
-            )
+        with keys.taken(submission.key):
+            if (earlier := jobs.keyed(submission.key)) is not None:
+                submission.check(earlier, None)
+                return SequenceJob.of(jobs.status(earlier.job_id))
+            async with queue.upload_folder(client, upload_bytes=0, owner=caller) as folder:
+                await queue.link_input(job_id, folder)
+                status = await queue.accept(
+                    folder, order, upload_sha256=before.upload_sha256, client=client, owner=caller
+                )
         return SequenceJob.of(status)
 
     @router.get("/v1/sequences/{job_id}", operation_id="get_sequence")
