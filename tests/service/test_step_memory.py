@@ -48,39 +48,53 @@ def test_steps_of_many_sizes_take_no_more_memory_than_the_largest_is_said_to_tak
     assert said <= 4 * taken, "the bound says little"
 
 
-_SGBM_STEPS = """
-import json
+_CLASSICAL_STEPS = """
+import json, sys
 import numpy as np
 from vergence_proto.geometry import RectifiedRig
+from vergence_service.inference.engines import load_model
 from vergence_service.inference.model import Step, StereoView
-from vergence_service.inference.sgbm_model import SgbmModel
 
 def resident(which):
     [line] = [line for line in open("/proc/self/status") if line.startswith(which)]
     return 1024 * int(line.split()[1])
 
-model = SgbmModel("sgbm", threads=1)
+model = load_model(
+    None, sys.argv[1], engine="auto", providers=["cpu"], threads=1, allow_spinning=False
+)
 random = np.random.default_rng(0)
 
 def step(height, width):
     rig = RectifiedRig(width, height, 500.0, 500.0, width / 2, width / 2, height / 2, 0.1)
     left = random.integers(0, 256, (height, width, 3), np.uint8)
-    model.step([Step(StereoView(left, left, rig, 1), None, 1)])
+    view = StereoView(left, left, rig, 1)
+    [result] = model.step([Step(view, None, 1)])
+    model.step([Step(view, result.state if model.card.recurrent else None, 1)])
     return model.step_bytes(height, width, 1, cold=True)
 
 step(16, 16)
 before = resident("VmRSS")
-most = max(step(*size) for size in ((480, 640), (200, 1600), (800, 1280)))
+most = max(step(*size) for size in json.loads(sys.argv[2]))
 print(json.dumps([resident("VmHWM") - before, most]))
 """
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_semi_global_matching_takes_no_more_memory_than_it_is_said_to_take() -> None:
+@pytest.mark.parametrize(
+    ("name", "sizes"),
+    [("sgbm", [(480, 640), (200, 1600), (800, 1280)]), ("patchmatch", [(480, 640), (120, 1280)])],
+    ids=["sgbm", "patchmatch"],
+)
+def test_classical_methods_take_no_more_memory_than_they_are_said_to_take(
+    name: str, sizes: list[tuple[int, int]]
+) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", _SGBM_STEPS], capture_output=True, text=True, check=False
+        [sys.executable, "-c", _CLASSICAL_STEPS, name, json.dumps(sizes)],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stderr[-2000:]
     taken, said = json.loads(done.stdout)
-    assert taken <= said
+    assert taken <= said, f"{taken >> 20} MiB"
     assert said <= 4 * taken, "the bound says little"

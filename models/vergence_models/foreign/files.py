@@ -32,7 +32,7 @@ from vergence_proto.model_io import MANIFEST_FORMAT, MANIFEST_NAME, ManifestErro
 
 _MOST_BYTES = (2 << 30) - (16 << 20)  # protobuf's limit of one message, with room for the names
 # The server finds these before it looks into the user's folder.
-_OWN_NAMES = {"lite", "full", "fast", "sgbm", "sgbm-half"}
+_OWN_NAMES = {"lite", "full", "fast", "sgbm", "sgbm-half", "patchmatch"}
 _CHECKPOINT = (b"\x80", b"PK")  # how a pickle begins, and a zip of them
 _NAME = re.compile(r"[a-z0-9][a-z0-9._-]*")
 

@@ -1,6 +1,6 @@
 """The choice of the engine that computes a model.
 
-An engine is imported when it is chosen: `sgbm` is served without onnxruntime.
+An engine is imported when it is chosen: classical methods are served without onnxruntime.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from vergence_proto.extras import how_to_install
 from vergence_service.inference.installed import ProviderUnavailable
+from vergence_service.inference.opencv_model import OpenCvModel
+from vergence_service.inference.patchmatch_model import PATCHMATCH_MODEL, PatchMatchModel
 from vergence_service.inference.sgbm_model import SGBM_MODELS, SgbmModel
 
 if TYPE_CHECKING:
@@ -20,7 +22,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-ServedModel: TypeAlias = "OnnxStereoModel | NativeStereoModel | SgbmModel"
+ServedModel: TypeAlias = "OnnxStereoModel | NativeStereoModel | OpenCvModel"
 
 NATIVE_MODEL = "lite"  # the model that the native engine has kernels for
 
@@ -36,17 +38,19 @@ def load_model(
 ) -> ServedModel:
     """Load a model into ``engine``: "auto", "native" or "onnxruntime".
 
-    "auto" is native for `lite` on a CPU, if the library is there and knows the weights. `sgbm` and
-    `sgbm-half` have no weights: OpenCV computes them, if the engine is "auto".
+    "auto" is native for `lite` on a CPU, if the library is there and knows the weights. `sgbm`,
+    `sgbm-half` and `patchmatch` have no weights: OpenCV computes them, if the engine is "auto".
 
     Raises ManifestError if the manifest cannot be used, and ProviderUnavailable if the engine or
     its execution provider cannot be used.
     """
-    if name in SGBM_MODELS:
+    if name in SGBM_MODELS or name == PATCHMATCH_MODEL:
         if engine != "auto":
             raise ProviderUnavailable(
                 f"OpenCV computes {name}; set model.engine to auto, not {engine!r}"
             )
+        if name == PATCHMATCH_MODEL:
+            return PatchMatchModel(threads=threads)
         return SgbmModel(name, threads=threads)
     try:
         from vergence_service.inference.native_model import NativeStereoModel

@@ -3,21 +3,15 @@
 It has no weights and no memory, so every frame is a cold start.
 """
 
-import hashlib
-from collections.abc import Sequence
-
-import cv2
 import numpy as np
 
-from vergence_proto.model_io import ModelCard
 from vergence_proto.sgbm import sgbm_matches
-from vergence_service.inference.installed import PROVIDERS, usable_cores
 from vergence_service.inference.model import RecurrentState, Step, StepResult
+from vergence_service.inference.opencv_model import MAX_DISPARITY_PX, OpenCvModel
 
 # The models, and the size at which each matches.
 SGBM_MODELS = {"sgbm": 1.0, "sgbm-half": 0.5}
 
-MAX_DISPARITY_PX = 192
 # Half of its matches on the bundled room are closer than sigma times ln 2. What it does not match
 # is off by several pixels.
 _SIGMA_PX = {"sgbm": 0.5, "sgbm-half": 0.6}
@@ -31,52 +25,18 @@ _BYTES_A_COST = 40
 _BESIDE_PIXELS = 2 << 20
 
 
-class SgbmModel:
+class SgbmModel(OpenCvModel):
     """OpenCV's StereoSGBM in its three-way mode.
 
-    A hole takes the farther of its neighbours, with a wide sigma. Each thread steps a frame.
+    A hole takes the farther of its neighbours, with a wide sigma.
     """
 
     def __init__(self, name: str, *, threads: int) -> None:
-        about = f"{name} {MAX_DISPARITY_PX} OpenCV {cv2.__version__}"
-        self._card = ModelCard(
-            name=name,
-            stride=_STRIDE,
-            max_disparity_px=MAX_DISPARITY_PX,
-            state=(),
-            graphs={1: ()},
-            weights_sha256=hashlib.sha256(about.encode()).hexdigest(),
-        )
-        self._threads = threads or usable_cores()
-
-    @property
-    def card(self) -> ModelCard:
-        return self._card
-
-    @property
-    def provider(self) -> str:
-        return PROVIDERS["cpu"]
-
-    @property
-    def engine(self) -> str:
-        return f"OpenCV {cv2.__version__}"
-
-    @property
-    def max_concurrent_steps(self) -> int:
-        return self._threads
-
-    def warm_up(self, iterations: int, *cold_iterations: int) -> None:
-        """There is nothing to load."""
+        super().__init__(name, threads=threads, stride=_STRIDE)
 
     def step_bytes(self, height: int, width: int, iterations: int, *, cold: bool) -> int:
         costs = (width + MAX_DISPARITY_PX) * MAX_DISPARITY_PX
         return _BESIDE_PIXELS + _BYTES_A_PIXEL * height * width + _BYTES_A_COST * costs
-
-    def close(self) -> None:
-        """There is nothing to stop."""
-
-    def step(self, steps: Sequence[Step]) -> list[StepResult]:
-        return [self._step(step) for step in steps]
 
     def _step(self, step: Step) -> StepResult:
         height, width = step.view.left.shape[:2]

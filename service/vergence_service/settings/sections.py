@@ -98,7 +98,8 @@ class AdminSettings(Section):
 
 class ModelSettings(Section):
     name: str = Field(
-        default="lite", description="model of the manifest, or sgbm or sgbm-half of OpenCV"
+        default="lite",
+        description="model of the manifest, or a classical one: sgbm, sgbm-half, patchmatch",
     )
     weights: Path | None = Field(
         default=None,
