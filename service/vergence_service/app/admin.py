@@ -7,11 +7,11 @@ import socket
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import replace
-from typing import Any
 
 from prometheus_client import CollectorRegistry
 
 from vergence_service.access.gate import Gate
+from vergence_service.app.http import HttpTransport
 from vergence_service.app.security import host_names
 from vergence_service.settings import Settings
 from vergence_service.streams.engine import DepthEngine
@@ -21,6 +21,7 @@ from vergence_service.transports.http.admin import Logins, make_admin_app
 from vergence_service.transports.http.app import HttpServer
 from vergence_service.transports.http.border import Border
 from vergence_service.transports.http.connections import ConnectionLimits
+from vergence_service.transports.http.viewing import viewing_routes
 from vergence_service.transports.tls import Certificate
 
 log = logging.getLogger(__name__)
@@ -37,12 +38,12 @@ async def serving_admin(
     gate: Gate,
     certificate: Certificate | None,
     *,
-    schema: Callable[[], dict[str, Any]],
+    http: HttpTransport,
     clock: Callable[[], float],
 ) -> AsyncIterator[HttpServer]:
     """Serve metrics, the page and the administrator's calls until the end of the block.
 
-    ``schema`` is that of the HTTP API. Raises PortTaken if the server cannot listen there.
+    The page uses what ``http`` serves. Raises PortTaken if the server cannot listen there.
     """
     limits = settings.limits
     with _listening(settings) as listening:
@@ -51,7 +52,9 @@ async def serving_admin(
             engine,
             registry,
             logins,
-            public_schema=schema,
+            jobs=None if http.jobs is None else http.jobs.jobs,
+            routes=[viewing_routes(engine, images=settings.admin.images), http.pairs],
+            public_schema=http.schema,
             clock=clock,
             secure=certificate is not None,
         )

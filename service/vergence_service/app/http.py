@@ -11,6 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from fastapi import APIRouter
 from prometheus_client import CollectorRegistry
 
 from vergence_service.access.gate import Gate
@@ -49,6 +50,7 @@ class HttpTransport:
         JobQueue | None
     )  # to be started when every graph is loaded; None: there is no disk for jobs
     schema: Callable[[], dict[str, Any]]  # OpenAPI
+    pairs: APIRouter  # for the administrator's page too
 
 
 @asynccontextmanager
@@ -98,8 +100,9 @@ async def serving_http(
         listening = stack.enter_context(
             listening_socket(host, settings.http.port, transport="http")
         )
+        pairs = pair_routes(engine, places, limits=pair)
         routes = [
-            pair_routes(engine, places, limits=pair),
+            pairs,
             inference_routes(engine, places, limits=pair),
             stream_routes(
                 calls,
@@ -159,7 +162,7 @@ async def serving_http(
                 trusted_proxies=settings.security.trusted_proxies,
             )
         )
-        yield HttpTransport(server, queue, app.openapi)
+        yield HttpTransport(server, queue, app.openapi, pairs)
 
 
 @contextmanager

@@ -230,7 +230,7 @@ async def running(
         ) as http,
         serving_zenoh(settings, unary, open_calls("zenoh"), gate) as zenoh,
         serving_admin(
-            settings, engine, registry, gate, certificate, schema=http.schema, clock=clock
+            settings, engine, registry, gate, certificate, http=http, clock=clock
         ) as admin,
         _in_background(_sweep(streams)),
         _in_background(keep_current(gate, certificate, engine)),

@@ -94,6 +94,9 @@ class AdminSettings(Section):
     port: int | None = Field(
         default=None, ge=0, le=65535, description="TCP port; default: 8001, or a free one"
     )
+    images: bool = Field(
+        default=True, description="let administrators see the images and the depth of streams"
+    )
 
 
 class ModelSettings(Section):

@@ -38,6 +38,7 @@ from vergence_service.streams.search_window import SearchReach
 from vergence_service.streams.stream import Attachment, Notice, NoticeKind, Stream, StreamConfig
 from vergence_service.streams.table import StreamTable
 from vergence_service.streams.turns import Turns
+from vergence_service.streams.viewers import Viewers
 from vergence_service.threads import Cost, Threads
 
 # A client that comes while the model loads waits for at most this long. It is below the time that
@@ -84,6 +85,7 @@ class DepthEngine:
         self.max_pixels = sizes.max_pixels
         self.metrics = metrics
         self.threads = threads
+        self.viewers = Viewers()
         self._batcher = batcher
         self._model = model
         self._sizes = sizes
@@ -390,9 +392,11 @@ class DepthEngine:
         self.metrics.frames_stepped.labels(origin.name.lower()).inc()
         for stage in ("decode", "queue", "model"):
             self.metrics.stage_s.labels(stage).observe(getattr(timings, f"{stage}_s"))
-        return SteppedFrame(
+        stepped = SteppedFrame(
             stream, frame_id, arrived_s, view, result, origin, iterations, skipped, timings
         )
+        self.viewers.show(stepped)
+        return stepped
 
     def _forget(self, stream: Stream, reason: Origin) -> None:
         """Discard the stream's state. A model without memory has none, so it has no reason."""

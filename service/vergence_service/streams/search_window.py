@@ -76,6 +76,11 @@ class SearchWindow:
         disparity_px[(disparity_px <= 0) | (disparity_px > self.max_disparity_px)] = np.nan
         return disparity_px
 
+    def left_of(self, image: Image, height: int, width: int) -> Image:
+        """What the left camera of the rig saw, of the image that the model sees, reduced as it."""
+        first = self.left_shift_px // self.reduction
+        return image[: -(-height // self.reduction), first : first - (-width // self.reduction)]
+
     def sigma_px(self, sigma_px: Plane, height: int, width: int) -> Plane:
         """Sigma [H, W] in the rig's pixels."""
         return self._enlarged(sigma_px, height, width)

@@ -3,31 +3,41 @@
 import html
 import secrets
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
-from typing import Any
+from typing import Annotated, Any
 from urllib.parse import parse_qs
 
-from fastapi import APIRouter, FastAPI, Request, Response
+from fastapi import APIRouter, FastAPI, Query, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
 from prometheus_client import CollectorRegistry
 
 from vergence_proto.errors import DepthError, Unauthenticated
 from vergence_service.access.gate import Gate
 from vergence_service.access.principals import Principal, Role
+from vergence_service.jobs.registry import JobRegistry
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.report import ServerReport, StreamReport, reports, server_report
+from vergence_service.transports.callers import CALLER
 from vergence_service.transports.http.errors import PROBLEM_RESPONSE, install_problems
 from vergence_service.transports.http.metrics import metrics_routes
+from vergence_service.transports.http.result_download import ResultDownloads
+from vergence_service.transports.http.sequence_models import ResultQuery
 
 COOKIE = "vergence_admin"
 LOGIN = "/login"
 _COOKIE_LIFE_S = 12 * 3600
 _MOST_LOGINS = 1000
 _LARGEST_FORM = 4096
+_MOST_SEQUENCES = 20
 # The page and the docs are files of this package: nothing is loaded from elsewhere.
-_ASSETS = {"page.js": "text/javascript", "page.css": "text/css"}
+_ASSETS = {
+    "page.js": "text/javascript",
+    "view.js": "text/javascript",
+    "depth.js": "text/javascript",
+    "page.css": "text/css",
+}
 _POLICY = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
     "connect-src 'self'; img-src 'self' data:; form-action 'self'; base-uri 'none'; "
@@ -36,11 +46,28 @@ _POLICY = {
 
 
 @dataclass(frozen=True, slots=True)
+class SequenceReport:
+    """A job: one sequence that was submitted."""
+
+    job_id: str  # empty for callers without a credential, since it is the job's secret
+    principal: str
+    name: str
+    state: str
+    frames: int
+    frames_done: int
+    frames_failed: int
+    eta_s: float | None
+    message: str | None
+
+
+@dataclass(frozen=True, slots=True)
 class AdminState:
     """What the page shows."""
 
     server: ServerReport
     streams: list[StreamReport]
+    sequences: list[SequenceReport]  # the newest ones
+    logged_in: bool  # False: the server asks for no credential
 
 
 class Logins:
@@ -90,11 +117,17 @@ def make_admin_app(
     registry: CollectorRegistry,
     logins: Logins,
     *,
+    jobs: JobRegistry | None,
+    routes: Sequence[APIRouter],
     public_schema: Callable[[], dict[str, Any]],
     clock: Callable[[], float],
     secure: bool,
 ) -> FastAPI:
-    """Make the application. ``public_schema`` is that of the HTTP API; ``secure``: over TLS."""
+    """Make the application.
+
+    ``routes`` are those that the page uses besides its own; ``public_schema`` is that of the HTTP
+    API; ``secure``: over TLS.
+    """
     app = FastAPI(title="Vergence, administration", docs_url=None, redoc_url=None)
     install_problems(app)
     app.include_router(metrics_routes(registry))
@@ -114,13 +147,18 @@ def make_admin_app(
     async def state() -> AdminState:
         """Get all that the page shows: the server, and its open streams."""
         now_s = clock()
-        return AdminState(server_report(engine, now_s), reports(engine.streams, now_s))
+        caller = CALLER.get()
+        return AdminState(
+            server_report(engine, now_s),
+            reports(engine.streams, now_s),
+            _sequences(jobs, caller) if jobs is not None else [],
+            logged_in=caller.proven,
+        )
 
     @router.delete("/v1/admin/streams/{principal}/{stream_id}", status_code=204)
-    async def close(principal: str, stream_id: str, request: Request) -> None:
+    async def close(principal: str, stream_id: str) -> None:
         """End a stream. It needs the token of an administrator, also on this machine."""
-        caller: Principal = request.scope["caller"]
-        if caller.role is not Role.ADMIN:
+        if CALLER.get().role is not Role.ADMIN:
             raise Unauthenticated("closing the stream of another needs an administrator's token")
         await engine.close(stream_id, owner=principal)
 
@@ -136,12 +174,17 @@ def make_admin_app(
 
     @router.get("/", response_class=HTMLResponse)
     async def page() -> HTMLResponse:
-        """Show the open streams, live."""
+        """Show the open streams and the jobs, live."""
         return HTMLResponse(_asset("page.html"), headers=_POLICY)
+
+    @router.get("/view", response_class=HTMLResponse)
+    async def view() -> HTMLResponse:
+        """Show the depth of a stream, live, or of two images that are dropped there."""
+        return HTMLResponse(_asset("view.html"), headers=_POLICY)
 
     @router.get("/assets/{name}")
     async def asset(name: str) -> Response:
-        """Get a file of the page."""
+        """Get a file of a page."""
         if name not in _ASSETS:
             return Response(status_code=404)
         return Response(_asset(name), media_type=_ASSETS[name])
@@ -185,7 +228,19 @@ def make_admin_app(
         answer.delete_cookie(COOKIE)
         return answer
 
-    app.include_router(router)
+    if jobs is not None:
+        downloads = ResultDownloads(jobs, engine.threads.background)
+
+        @router.get("/v1/admin/sequences/{job_id}/result", response_class=Response)
+        async def result(
+            request: Request, job_id: str, query: Annotated[ResultQuery, Query()]
+        ) -> Response:
+            """Download the result of a job."""
+            jobs.check_owner(job_id, CALLER.get())
+            return await downloads.answer(request, job_id, query.format)
+
+    for each in (router, *routes):
+        app.include_router(each)
     return app
 
 
@@ -194,6 +249,24 @@ _FORM = (
     '<input type="password" name="token" autocomplete="off" required autofocus></label> '
     "<button>Log in</button></form>"
 )
+
+
+def _sequences(jobs: JobRegistry, caller: Principal) -> list[SequenceReport]:
+    newest, _ = jobs.page(lambda job: True, size=_MOST_SEQUENCES)
+    return [
+        SequenceReport(
+            job_id=status.job.job_id if caller.proven else "",
+            principal=status.job.owner,
+            name=status.job.name or status.job.source.rstrip(":"),
+            state=status.job.state,
+            frames=status.job.frames,
+            frames_done=status.frames_done,
+            frames_failed=status.job.frames_failed,
+            eta_s=status.eta_s,
+            message=status.job.message,
+        )
+        for status in newest
+    ]
 
 
 def _asset(name: str) -> str:

@@ -136,7 +136,7 @@ class Border:
         if self._logins is not None:
             if scope["path"] not in _LOGIN_PATHS:
                 cookies = cookie_parser(headers.get("cookie", ""))
-                scope["caller"] = self._logins.caller(authorization, cookies)
+                CALLER.set(self._logins.caller(authorization, cookies))
             return
         names = scope.get("state", {}).get("certificate_names", ())
         caller = self._gate.caller(authorization, names)

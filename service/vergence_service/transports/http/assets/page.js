@@ -4,15 +4,22 @@ const EVERY_MS = 1000;
 const MIB = 1 << 20;
 let before = null; // the last answer, for rates
 
-// Clients choose ids, so nothing is ever set as HTML.
+// Clients choose ids, so nothing is ever set as HTML. A cell is a text or an element.
 function fill(id, rows) {
   const lines = rows.map(({ cells, away }) => {
     const line = document.createElement("tr");
     line.className = away ? "away" : "";
-    for (const cell of cells) line.insertCell().textContent = cell;
+    for (const cell of cells) line.insertCell().append(cell);
     return line;
   });
   document.getElementById(id).replaceChildren(...lines);
+}
+
+function link(text, path, query) {
+  const anchor = document.createElement("a");
+  anchor.href = `${path}?${new URLSearchParams(query)}`;
+  anchor.textContent = text;
+  return anchor;
 }
 
 function listed(counts) {
@@ -28,7 +35,7 @@ function streamRow(stream) {
     away: !stream.attached,
     cells: [
       stream.principal,
-      stream.stream_id,
+      link(stream.stream_id, "/view", { principal: stream.principal, stream: stream.stream_id }),
       `${stream.width}x${stream.height}`,
       stream.transport + (stream.address ? ` ${stream.address}` : ""),
       stream.rate_hz.toFixed(1),
@@ -40,6 +47,30 @@ function streamRow(stream) {
       stream.frames_stepped,
       listed({ "displaced by a newer frame": stream.frames_dropped, ...stream.failures }),
       stream.idle_s.toFixed(0),
+    ],
+  };
+}
+
+function sequenceRow(sequence) {
+  const bar = document.createElement("progress");
+  Object.assign(bar, { max: sequence.frames, value: sequence.frames_done });
+  const frames = document.createElement("span");
+  frames.append(bar, ` ${sequence.frames_done} of ${sequence.frames}`);
+  const path = `/v1/admin/sequences/${sequence.job_id}/result`;
+  const results = document.createElement("span");
+  if (sequence.job_id && sequence.state === "done") {
+    for (const format of ["png16", "npz", "mp4"]) results.append(link(format, path, { format }), " ");
+  }
+  return {
+    cells: [
+      sequence.principal,
+      sequence.name,
+      sequence.state,
+      frames,
+      sequence.frames_failed || "",
+      sequence.eta_s === null ? "" : `${sequence.eta_s.toFixed(0)} s`,
+      sequence.message ?? "",
+      results,
     ],
   };
 }
@@ -90,6 +121,7 @@ function show(answer) {
   });
   document.getElementById("facts").replaceChildren(...terms);
   fill("streams", streams.map(streamRow));
+  fill("sequences", answer.sequences.map(sequenceRow));
   fill(
     "principals",
     server.principals.map((each) => principalRow(each, elapsed_s, server.lanes)),
@@ -98,6 +130,7 @@ function show(answer) {
     Object.entries(counts).map(([why, count]) => ({ cells: [what, why, count] })),
   );
   fill("refusals", refusals);
+  document.getElementById("logout").hidden = !answer.logged_in;
   before = answer;
 }
 
