@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import httpx
 import numpy as np
 import pytest
@@ -23,6 +22,7 @@ from tests.support.sequences import make_frames, sequence_files, zip_bytes
 from tests.support.server import PATIENCE_S, RawCall, raw_stream, running_server
 from tests.support.tokens import TokenFile, http_as, stub
 from vergence_proto import codec
+from vergence_proto.codec.images import decode_image
 from vergence_proto.types import StereoFrame, StereoRig
 from vergence_service.app.server import Running
 
@@ -47,12 +47,11 @@ def planes_of(view: bytes) -> tuple[dict[str, Any], NDArray[np.uint8], list[NDAr
     header = json.loads(view[4 : 4 + text_bytes])
     jpeg_at = 4 + text_bytes
     planes_at = jpeg_at + header["jpeg_bytes"]
-    jpeg = np.frombuffer(view[jpeg_at:planes_at], np.uint8)
+    image = decode_image(view[jpeg_at:planes_at])
     stored = np.frombuffer(view, "<u2", offset=planes_at)
     planes = stored.reshape(2, header["height"], header["width"]) / np.float32(64)
     planes[planes == 0] = np.nan
-    image = cv2.cvtColor(cv2.imdecode(jpeg, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
-    return header, image.astype(np.uint8), [*planes.astype(np.float32)]
+    return header, image, [*planes.astype(np.float32)]
 
 
 def smooth_frame(rig: Any) -> StereoFrame:
