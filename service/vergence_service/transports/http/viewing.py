@@ -62,7 +62,7 @@ def viewing_routes(engine: DepthEngine, *, images: bool) -> APIRouter:
                 frame = await engine.viewers.next_frame(stream.key)
         except TimeoutError:
             return Response(status_code=204)
-        body = await engine.threads.background.run(view_of, frame)
+        body = await engine.threads.background.run(encode_view, frame)
         return Response(
             body, media_type="application/octet-stream", headers={"Cache-Control": "no-store"}
         )
@@ -70,7 +70,7 @@ def viewing_routes(engine: DepthEngine, *, images: bool) -> APIRouter:
     return router
 
 
-def view_of(frame: SteppedFrame) -> bytes:
+def encode_view(frame: SteppedFrame) -> bytes:
     """Encode a view of a frame. Call it in a worker thread."""
     rectifier, answer = frame.stream.rectifier, frame.disparity_map()
     sigma_px = rectifier.sigma_px(frame.result.sigma_px)
