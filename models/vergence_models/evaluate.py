@@ -1,4 +1,4 @@
-"""``python -m vergence_models.evaluate --json FILE``: the errors of a model and of SGBM.
+"""``python -m vergence_models.evaluate --json FILE``: errors of a model, of SGBM and PatchMatch.
 
     python -m vergence_models.evaluate --json out.json --data vergence:DIR --pool pool/val
     python -m vergence_models.evaluate --no-evidence
@@ -21,11 +21,11 @@ from pathlib import Path
 from rich.progress import Progress
 
 from vergence_models.data.pool import ClipPool
+from vergence_models.evaluation.classical import classical_methods
 from vergence_models.evaluation.direct_labels import End, label_ends
 from vergence_models.evaluation.evidence import SURE, Doubt, doubts_of
 from vergence_models.evaluation.methods import (
     Method,
-    sgbm_methods,
     single_frame_method,
     warm_method,
     with_pose_noise,
@@ -267,7 +267,7 @@ def main(arguments: list[str] | None = None) -> None:
         methods = [m for each in networks for m in methods_for(each, thorough=given.thorough)]
         with progress_bar() as progress:
             results = evaluate(
-                methods + sgbm_methods(),
+                methods + classical_methods(),
                 gather(sources, given.pool, given.clips),
                 progress=progress,
                 count=len(sources) + sum(min(given.clips, len(ClipPool(p))) for p in given.pool),

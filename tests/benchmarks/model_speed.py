@@ -1,11 +1,12 @@
-"""What a step of lite costs, natively and in onnxruntime, beside StereoSGBM: one run, one pair.
+"""What a step of lite costs, natively and in onnxruntime, beside classical methods: one pair.
 
     python tests/benchmarks/model_speed.py --json FILE [--variant avx2]
 
 A warm step of the service's models, 640x480, batch 1, one iteration, two threads, with the settings
 that the service has by default; SGBM 3-way with its holes filled, at full and at half size. The
 methods take turns, so that a busy moment of the machine hits all of them. Then the first frame of a
-live stream and of one that wants every frame, by themselves. Times are medians in milliseconds; CPU
+live stream and of one that wants every frame, by themselves, and PatchMatch: a warm step of one
+iteration, and a first frame of three. Times are medians in milliseconds; CPU
 time counts every thread of the process. `--variant` makes the native step use other instructions
 than the best; onnxruntime always uses the best of this CPU (isa).
 """
@@ -29,6 +30,7 @@ from vergence_proto.sgbm import sgbm_disparity
 from vergence_service.inference.model import Step, StereoView
 from vergence_service.inference.native_model import NativeStereoModel
 from vergence_service.inference.onnx_model import OnnxStereoModel, packaged_weights_dir
+from vergence_service.inference.patchmatch_model import PatchMatchModel
 from vergence_service.settings.sections import ModelSettings
 
 HEIGHT, WIDTH = 480, 640
@@ -119,6 +121,15 @@ def main() -> None:
         },
         STARTS,
     )
+    patches = PatchMatchModel(threads=given.threads)
+    (first,) = patches.step([Step(view, None, 3)])
+    patched = measure(
+        {
+            "patchmatch": lambda: patches.step([Step(view, first.state, 1)]),
+            "patchmatch_start": lambda: patches.step([Step(view, None, 3)]),
+        },
+        STARTS,
+    )
     results = {
         "native_ms": found["native"][0],
         "native_cpu_ms": found["native"][1],
@@ -126,6 +137,8 @@ def main() -> None:
         "ort_cpu_ms": found["ort"][1],
         "sgbm_full_cpu_ms": found["sgbm_full"][1],
         "sgbm_half_cpu_ms": found["sgbm_half"][1],
+        **{f"{name}_ms": step_ms for name, (step_ms, _) in patched.items()},
+        "patchmatch_cpu_ms": patched["patchmatch"][1],
         "fps": 1e3 / found["native"][0],
         **{name: start_ms for name, (start_ms, _) in first_frames.items()},
     }

@@ -27,7 +27,7 @@ from tests.support.foreign_graphs import (
     written,
 )
 from vergence_models.evaluate import evaluate, methods_for
-from vergence_models.evaluation.methods import sgbm_methods
+from vergence_models.evaluation.classical import classical_methods
 from vergence_models.evaluation.stepping import Footage, FootageView
 from vergence_models.foreign.adding import Added, add_model, check_model
 from vergence_models.foreign.command import models
@@ -373,12 +373,13 @@ def test_a_model_that_was_added_is_a_row_beside_the_others(
         gather_networks([], [], threads=1, models=["other"])
     pair = scene(HEIGHT, WIDTH, 6, 30, seed=5)
     footage = Footage("pair", RIG, [FootageView(pair.left, pair.right, None, pair.truth_px)])
-    methods = methods_for(studied.network, thorough=True) + sgbm_methods()
+    methods = methods_for(studied.network, thorough=True) + classical_methods()
     found = evaluate(methods, iter([("pair", footage)]))["pair"]
     assert list(found) == [
         "theirs, every frame cold, 1 iteration",
         "SGBM, full size",
         "SGBM, half size",
+        "PatchMatch, warm, 1 iteration",
     ]
     assert found["theirs, every frame cold, 1 iteration"].summary()["epe"] < 0.5
 

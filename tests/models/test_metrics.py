@@ -106,9 +106,11 @@ def test_the_command_reports_every_method(
     write_shard(tmp_path / "pool" / "shard_1_000000", wall_clips(1, height=192, width=256))
     pool, out, plots = (str(tmp_path / name) for name in ("pool", "out.json", "plots"))
     main(["--pool", pool, "--json", out, "--plots", plots, "--thorough"])
-    assert "SGBM, half size" in capsys.readouterr().out
+    table = capsys.readouterr().out
+    assert "SGBM, half size" in table
+    assert "PatchMatch, warm, 1 iteration" in table
     written = json.loads((tmp_path / "out.json").read_text())["pool pool"]
-    assert len(written) == 6
+    assert len(written) == 7
     for measures in written.values():
         assert len(measures["epe_by_frame"]) == 3
         assert measures["tepe"] >= 0

@@ -15,7 +15,6 @@ import numpy as np
 from vergence_models.data.trajectories import rotation
 from vergence_models.evaluation.stepping import Footage, Prediction, SteppedNetwork
 from vergence_proto.geometry import Pose
-from vergence_proto.sgbm import sgbm_disparity
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,20 +52,6 @@ def single_frame_method(network: SteppedNetwork, name: str, iterations: int) -> 
         f"{name}, every frame cold, {counted_start(network, iterations)}",
         lambda footage: network.sequence(footage, cold=iterations, warm=None),
     )
-
-
-def sgbm_method(label: str, scale: float) -> Method:
-    def predict(footage: Footage) -> Iterator[Prediction]:
-        limit = 192 if len(footage.views) == 1 and footage.rig.width > 700 else 128
-        for view in footage.views:
-            found = sgbm_disparity(view.left, view.right, max_disparity_px=limit, scale=scale)
-            yield Prediction(found)
-
-    return Method(label, predict)
-
-
-def sgbm_methods() -> list[Method]:
-    return [sgbm_method("SGBM, full size", 1.0), sgbm_method("SGBM, half size", 0.5)]
 
 
 def without_poses(footage: Footage) -> Footage:

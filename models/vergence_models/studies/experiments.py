@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from vergence_models.evaluate import COLUMNS, figures
+from vergence_models.evaluation.classical import classical_methods, patchmatch_without_memory
 from vergence_models.evaluation.methods import (
     Method,
     counted_start,
-    sgbm_methods,
     with_pose_noise,
     without_poses,
 )
@@ -35,11 +35,11 @@ Study = Callable[[Bench], Table]
 
 
 def every_method(bench: Bench) -> list[Method]:
-    """The main table's: single frame and warm at every count there is, and SGBM."""
+    """The main table's: single frame and warm at every count there is, SGBM and PatchMatch."""
     methods = []
     for studied in bench.networks:
         methods += studied.single_frame_methods() + studied.warm_methods()
-    return methods + sgbm_methods()
+    return [*methods, *classical_methods(), patchmatch_without_memory()]
 
 
 def one_iteration(bench: Bench) -> list[tuple[StudiedNetwork, Method]]:
