@@ -22,7 +22,7 @@ from tests.support.tokens import TokenFile
 from tests.support.zenoh_net import address_of, free_endpoint
 from tests.support.zenoh_sessions import step
 from vergence import ConnectionLost, DepthClient
-from vergence_proto.errors import BadShape, UnknownStream
+from vergence_proto.errors import BadShape, Quota, UnknownStream
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.zenoh.inbox import Inbox
 from vergence_proto.zenoh.keys import ANY, StreamKeys, query_key
@@ -256,6 +256,24 @@ async def test_a_third_node_sees_nothing_and_cannot_answer(tmp_path: Path) -> No
         await step(session, 1)
         assert (await client.stream_info(session.stream_id)).frames_stepped == 1
     assert seen == []
+
+
+async def test_clients_whose_address_is_not_known_share_one_limit() -> None:
+    endpoint = free_endpoint()
+    async with (
+        running_server(
+            RecallModel(),
+            zenoh__enabled=True,
+            zenoh__listen=[endpoint],
+            limits__streams_per_client=1,
+        ),
+        DepthClient(address_of(endpoint)) as one,
+        DepthClient(address_of(endpoint)) as other,
+        one.open_session(RIG),
+    ):
+        with pytest.raises(Quota, match="streams_per_client"):
+            async with other.open_session(RIG, open_timeout_s=0.1):
+                pass
 
 
 async def test_each_user_has_its_own_keys(tmp_path: Path) -> None:

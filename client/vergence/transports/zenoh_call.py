@@ -18,12 +18,11 @@ from vergence_proto.errors import (
     FrameTooLarge,
     ModelFailed,
     NotReady,
-    Quota,
     StateMemory,
     StreamLimit,
 )
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_proto.zenoh.inbox import Inbox
+from vergence_proto.zenoh.inbox import Inbox, InboxFull
 from vergence_proto.zenoh.keys import ANY, OPEN, StreamKeys, place_of, query_key, server_key
 from vergence_proto.zenoh.session import Declaration, ZenohSession, reason_of
 
@@ -97,7 +96,7 @@ class ZenohCall:
         while not self._ready:
             try:
                 message = await self._inbox.take()
-            except Quota as error:
+            except InboxFull as error:
                 raise ConnectionLost(f"the server sent more than was asked for: {error}") from None
             match message:
                 case pb.DisparityMap():

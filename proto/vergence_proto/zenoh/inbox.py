@@ -32,12 +32,16 @@ _READERS: dict[str, Callable[[bytes], Received]] = {
 }
 
 
+class InboxFull(Quota):
+    """The other side sent more than this side has asked for."""
+
+
 class Inbox:
     """Messages in the order of their arrival, decoded when they are taken.
 
     At most ``max_bulky`` messages of type ``bulky`` wait. If one more arrives and ``drop_oldest``
     is set, the oldest bulky message is dropped; all other messages keep their place in the order.
-    Without ``drop_oldest`` the inbox ends with Quota, because the sender has exceeded its credit.
+    Without ``drop_oldest`` the inbox ends with InboxFull: the sender has exceeded its credit.
     """
 
     def __init__(
@@ -71,7 +75,7 @@ class Inbox:
                 del self._waiting[alike[0]]
                 self._waiting.append((encoding, sample.payload))
             else:
-                self._end = self._end or Quota(
+                self._end = self._end or InboxFull(
                     "more messages wait than the credit allows; send only when answers arrive"
                 )
         with suppress(RuntimeError):  # the loop has closed before the session
@@ -92,7 +96,7 @@ class Inbox:
         """Remove and return the oldest message; wait until there is one.
 
         A message that does not decode is discarded, as if the network had lost it.
-        Raises the error given to :meth:`end`, or Quota: too many messages wait.
+        Raises the error given to :meth:`end`, or InboxFull: too many messages wait.
         """
         while True:
             with self._lock:

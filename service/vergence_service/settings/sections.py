@@ -223,7 +223,9 @@ class LimitSettings(Section):
         description="disk space of all uploads, sequences and results of one principal",
     )
     streams_per_client: PositiveInt | None = Field(
-        default=None, description="most open streams of one address, over gRPC and HTTP"
+        default=None,
+        description="most open streams of one address; clients over Zenoh without a token count as "
+        "one",
     )
 
 
