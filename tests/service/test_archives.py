@@ -10,10 +10,11 @@ import pytest
 from tests.support.http import ZIP, ended, files_below, http_server, submit
 from tests.support.models import RecallModel
 from tests.support.sequences import make_frames, sequence_files, tar_bytes, zip_bytes
-from vergence_proto.errors import UploadTooLarge
-from vergence_service.jobs.archives import ArchiveLimits, unpacking
+from vergence_proto.errors import BadSequence, UploadTooLarge
+from vergence_service.jobs.archive_limits import ArchiveLimits
+from vergence_service.jobs.archives import ArchiveUnpacker, unpacking
 
-LIMITS = ArchiveLimits(max_files=100, max_unpacked_bytes=1 << 20, max_ratio=100.0)
+LIMITS = ArchiveLimits(max_files=100, max_unpacked_bytes=2 << 20, max_ratio=100.0)
 FILES = dict(sequence_files(make_frames(2)))
 APPLE_DOUBLE = b"\0\5\26\7"
 
@@ -79,6 +80,71 @@ async def test_a_calibration_may_start_with_a_byte_order_mark(tmp_path: Path) ->
     async with http_server(RecallModel()) as client:
         answer = await client.post("/v1/sequences", content=zip_bytes(marked.items()), headers=ZIP)
     assert answer.status_code == 202
+
+
+def tar_of(mode: str, form: int) -> tuple[bytes, dict[str, bytes]]:
+    """A tar with names and sizes that need headers of their own."""
+    long = "a" * 90
+    files = {f"räume/{long}/{long}/{index}.png": os.urandom(700 * index) for index in range(4)}
+    archive = io.BytesIO()
+    with tarfile.open(fileobj=archive, mode=mode, format=form) as file:  # type: ignore[call-overload] # a mode
+        folder = tarfile.TarInfo("räume")
+        folder.type = tarfile.DIRTYPE
+        file.addfile(folder)
+        for name, content in files.items():
+            info = tarfile.TarInfo(name)
+            info.size = len(content)
+            info.pax_headers = {"comment": "x" * 600}
+            file.addfile(info, io.BytesIO(content))
+    return archive.getvalue(), files
+
+
+@pytest.mark.parametrize("at_once", [1, 511, 1 << 20])
+@pytest.mark.parametrize("form", [tarfile.GNU_FORMAT, tarfile.PAX_FORMAT], ids=["gnu", "pax"])
+@pytest.mark.parametrize("mode", ["w", "w:gz", "w:bz2", "w:xz"])
+def test_a_tar_is_unpacked_while_it_arrives(
+    mode: str, form: int, at_once: int, tmp_path: Path
+) -> None:
+    archive, files = tar_of(mode, form)
+    half = len(archive) // 2
+    unpacker = ArchiveUnpacker(tmp_path, tmp_path / "archive", LIMITS)
+    for at in range(0, half, at_once):
+        unpacker.feed(archive[at : min(at + at_once, half)])
+    if mode == "w":
+        assert any(path.is_file() for path in tmp_path.rglob("*.png"))
+    for at in range(half, len(archive), at_once):
+        unpacker.feed(archive[at : at + at_once])
+    list(unpacker.finishing())
+    unpacker.close()
+    assert not (tmp_path / "archive").exists()
+    found = {str(path.relative_to(tmp_path)): path for path in tmp_path.rglob("*.png")}
+    assert {name: path.read_bytes() for name, path in found.items()} == files
+
+
+@pytest.mark.parametrize("share", [0.02, 0.5, 0.9])
+def test_a_tar_that_is_cut_short_is_refused(share: float, tmp_path: Path) -> None:
+    archive, _ = tar_of("w", tarfile.PAX_FORMAT)
+    unpacker = ArchiveUnpacker(tmp_path, tmp_path / "archive", LIMITS)
+    unpacker.feed(archive[: round(share * (len(archive) - 10240))])
+    with pytest.raises(BadSequence, match="cut short"):
+        list(unpacker.finishing())
+    unpacker.close()
+
+
+def test_a_zip_shrinks_while_it_is_unpacked(tmp_path: Path) -> None:
+    files = {f"{index}.png": os.urandom(200_000) for index in range(5)}
+    scratch = tmp_path / "archive"
+    target = tmp_path / "target"
+    target.mkdir()
+    unpacker = ArchiveUnpacker(target, scratch, LIMITS)
+    unpacker.feed(zip_bytes(files.items()))
+    used = []
+    for _ in unpacker.finishing():
+        unpacked_bytes = sum(path.stat().st_size for path in target.iterdir())
+        used.append(scratch.stat().st_size + unpacked_bytes)
+    assert max(used) < 1_250_000  # the archive, and one file that is written
+    assert not scratch.exists()
+    assert {path.name: path.read_bytes() for path in target.iterdir()} == files
 
 
 @pytest.mark.parametrize(

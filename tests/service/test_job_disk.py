@@ -37,7 +37,8 @@ from tests.support.server import running_server
 from vergence_proto.errors import BadSequence, InsufficientStorage, UploadTooLarge
 from vergence_proto.jobs import JobState
 from vergence_service.app.server import drain
-from vergence_service.jobs.archives import ArchiveLimits, unpacking
+from vergence_service.jobs.archive_limits import ArchiveLimits
+from vergence_service.jobs.archives import unpacking
 from vergence_service.jobs.storage import disk_trouble
 from vergence_service.jobs.store import JobStore
 
@@ -313,6 +314,20 @@ def test_a_directory_is_counted_before_anything_is_unpacked(
     with pytest.raises(UploadTooLarge, match=refusal):
         list(unpacking(archive, target, ArchiveLimits(**{**usual, **limits})))
     assert not any(target.iterdir())
+
+
+async def test_limits_follow_the_free_space_of_the_disk(tmp_path: Path) -> None:
+    def announced(kib: int) -> dict[str, str]:
+        return {"Tus-Resumable": "1.0.0", "Upload-Length": str(kib << 10)}
+
+    with small_disk(tmp_path, kib=4096):
+        async with http_server(RecallModel(), batch__directory=tmp_path) as client:
+            refused = await client.post("/v1/uploads", headers=announced(4200))
+            assert refused.status_code == 413
+            assert "batch.max_upload_mib" in refused.json()["detail"]
+            assert (await client.post("/v1/uploads", headers=announced(2000))).status_code == 201
+            refused = await client.post("/v1/uploads", headers=announced(2100))
+            assert refused.status_code == httpx.codes.INSUFFICIENT_STORAGE
 
 
 def test_an_archive_that_the_disk_has_no_room_for_is_not_unpacked(tmp_path: Path) -> None:

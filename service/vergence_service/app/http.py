@@ -5,7 +5,7 @@ import logging
 import os
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,9 +16,10 @@ from prometheus_client import CollectorRegistry
 
 from vergence_service.access.gate import Gate
 from vergence_service.app.security import host_names, is_loopback
-from vergence_service.jobs.archives import ArchiveLimits
+from vergence_service.jobs.archive_limits import ArchiveLimits
 from vergence_service.jobs.places import Places
 from vergence_service.jobs.queue import JobQueue, QueueLimits
+from vergence_service.jobs.storage import free_bytes
 from vergence_service.jobs.store import JobStore, StoreInUse, StoreUnavailable
 from vergence_service.settings import Settings
 from vergence_service.streams.engine import DepthEngine
@@ -74,25 +75,13 @@ async def serving_http(
     Raises PortTaken if the server cannot listen on ``host``.
     """
     batch = settings.batch
-    archive = ArchiveLimits(
-        max_files=batch.max_files,
-        max_unpacked_bytes=batch.max_unpacked_mib * _MIB,
-        max_ratio=batch.max_ratio,
-    )
     min_bytes_per_s = settings.limits.min_kib_per_s * 1024
-    upload = UploadLimits(
-        max_bytes=batch.max_upload_mib * _MIB,
-        max_bytes_setting="batch.max_upload_mib",
-        idle_s=batch.idle_s,
-        min_bytes_per_s=min_bytes_per_s,
-        archive=archive,
-    )
     pair = UploadLimits(
         max_bytes=2 * settings.limits.max_frame_mib * _MIB,
         max_bytes_setting="limits.max_frame_mib",
         idle_s=batch.idle_s,
         min_bytes_per_s=min_bytes_per_s,
-        archive=replace(archive, max_files=2),
+        archive=ArchiveLimits(max_files=2, max_unpacked_bytes=0, max_ratio=0),  # no archives
     )
     stopping = asyncio.Event()
     async with AsyncExitStack() as stack:
@@ -121,6 +110,7 @@ async def serving_http(
             log.warning("this server accepts no sequences: %s", error)
             routes.append(no_sequence_routes(str(error)))
         else:
+            upload = _upload_limits(settings, store)
             queue = await stack.enter_async_context(
                 JobQueue(
                     engine,
@@ -131,8 +121,8 @@ async def serving_http(
                         waiting_per_principal=settings.limits.waiting_sequences,
                         checkpoint_s=batch.checkpoint_s,
                         keep_s=batch.keep_h * 3600,
-                        disk_bytes=batch.disk_mib * _MIB,
-                        principal_bytes=settings.limits.sequences_mib * _MIB,
+                        disk_bytes=_bytes_of(batch.disk_mib),
+                        principal_bytes=_bytes_of(settings.limits.sequences_mib),
                         webhook_hosts=batch.webhook_hosts,
                         inputs=batch.inputs,
                     ),
@@ -163,6 +153,28 @@ async def serving_http(
             )
         )
         yield HttpTransport(server, queue, app.openapi, pairs)
+
+
+def _bytes_of(mib: int | None) -> int | None:
+    return None if mib is None else mib * _MIB
+
+
+def _upload_limits(settings: Settings, store: JobStore) -> UploadLimits:
+    batch = settings.batch
+    room = free_bytes(store.directory)
+    unpacked_bytes = _bytes_of(batch.max_unpacked_mib)
+    upload_bytes = _bytes_of(batch.max_upload_mib)
+    return UploadLimits(
+        max_bytes=room if upload_bytes is None else upload_bytes,
+        max_bytes_setting="batch.max_upload_mib",
+        idle_s=batch.idle_s,
+        min_bytes_per_s=settings.limits.min_kib_per_s * 1024,
+        archive=ArchiveLimits(
+            max_files=batch.max_files,
+            max_unpacked_bytes=room if unpacked_bytes is None else unpacked_bytes,
+            max_ratio=batch.max_ratio,
+        ),
+    )
 
 
 @contextmanager

@@ -1,11 +1,11 @@
 """Unpack an untrusted zip or tar archive into a folder, or refuse it.
 
-Nothing that the archive states is trusted: unpacked bytes are counted, names may only lead below
-the folder, and anything except files and folders is refused. What macOS adds (``__MACOSX``, names
-with a dot in front) is passed over.
+Anything except files and folders is refused; see :mod:`vergence_service.jobs.archive_limits` for
+names and sizes. What macOS adds (``__MACOSX``, names with a dot in front) is passed over. A tar is
+unpacked while it arrives. A zip has its directory at the end: when it is complete, it is unpacked
+from there to its beginning, and the file shrinks meanwhile. So there is one copy on the disk.
 """
 
-import bz2
 import errno
 import gzip
 import lzma
@@ -14,31 +14,28 @@ import stat
 import tarfile
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from io import BufferedIOBase
-from pathlib import Path, PurePosixPath
-from typing import IO, BinaryIO
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
 
 from vergence_proto.datasets.listing import is_data
-from vergence_proto.errors import BadSequence, InsufficientStorage, UploadTooLarge
-from vergence_service.jobs.limited_reads import limited_reads, open_xz
+from vergence_proto.errors import BadSequence
+from vergence_service.jobs.archive_limits import (
+    NAME_BYTES,
+    ArchiveBudget,
+    ArchiveLimits,
+    new_file,
+    target_path,
+)
+from vergence_service.jobs.limited_reads import limited_reads
 from vergence_service.jobs.storage import free_bytes
+from vergence_service.jobs.tar_stream import TarUnpacker
 
 _CHUNK = 1 << 16
-_LONGEST_NAME = 512
 _ENTRY_BYTES = 160  # of a usual name in the directory of a zip
 _LEAST_DIRECTORY = 1 << 20
-_NAME_BYTES = 512  # what an empty file costs: the header of a tar, about an entry of a file system
-_LONGEST_PART_BYTES = 255  # limit of common file systems
-# A colon or a backslash is a character like any other, but not on Windows.
-_NOT_IN_NAMES = '\\/:*?"<>|\0' if os.name == "nt" else "\0"
 _ZIP_START = b"PK"
-_DECOMPRESSORS: dict[bytes, Callable[[Path], BufferedIOBase]] = {
-    b"\x1f\x8b": gzip.GzipFile,
-    b"BZh": bz2.BZ2File,
-    b"\xfd7zXZ": open_xz,
-}
 # Errors of the standard library about archives that are damaged or malicious.
 _DAMAGED = (
     zipfile.BadZipFile,
@@ -50,48 +47,95 @@ _DAMAGED = (
     gzip.BadGzipFile,
     UnicodeError,
     ValueError,
-    RecursionError,  # a header of a tar that says that another one follows, and so on
+    RecursionError,
 )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ArchiveLimits:
-    """The limits of one archive."""
+class ArchiveUnpacker:
+    """Unpacks an archive into ``folder`` while it arrives. Its methods block.
 
-    max_files: int
-    max_unpacked_bytes: int
-    # Largest unpacked size relative to the archive. Images are already compressed, so an archive of
-    # images hardly shrinks; an archive of zeros shrinks a thousandfold.
-    max_ratio: float
+    ``scratch`` is the path for a zip until it is complete. The caller removes both if a method
+    raises. They raise BadSequence if the file is not a zip or tar archive, is damaged or encrypted,
+    or contains links or names that lead out of the folder; UploadTooLarge if it has more files,
+    bytes or compression than ``limits`` allow; and InsufficientStorage if the disk has no room.
+    """
 
+    def __init__(self, folder: Path, scratch: Path, limits: ArchiveLimits) -> None:
+        self._folder, self._scratch, self._limits = folder, scratch, limits
+        self._budget = ArchiveBudget(limits, free_bytes(folder))
+        self._tar = TarUnpacker(folder, self._budget)
+        self._start = b""
+        self._is_zip: bool | None = None  # None: too little has come
+        self._file: BinaryIO | None = None  # of a zip
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Member:
-    name: str
-    declared_bytes: int
-    open: Callable[[], IO[bytes]]
+    def feed(self, data: bytes) -> None:
+        """Take the next bytes of the archive."""
+        self._budget.take_archive(len(data))
+        if self._is_zip is None:
+            data = self._start = self._start + data
+            if len(data) < len(_ZIP_START):
+                return
+            self._is_zip = data.startswith(_ZIP_START)
+            self._start = b""
+            if self._is_zip:
+                self._file = self._scratch.open("wb")
+        if self._file is not None:
+            self._file.write(data)
+            return
+        with _damage_refused():
+            self._tar.feed(data)
+
+    def finishing(self) -> Iterator[None]:
+        """Unpack what waited for the end, and yield after each short piece of work."""
+        if self._is_zip:
+            self.close()
+            yield from _unpacking_zip(self._scratch, self._folder, self._budget, consume=True)
+            self._scratch.unlink()
+            return
+        with _damage_refused():
+            if self._is_zip is None:
+                raise EOFError("it is cut short")
+            self._tar.end()
+        self._budget.complete()
+
+    def close(self) -> None:
+        """Close the files that are being written."""
+        self._tar.close()
+        if self._file is not None:
+            self._file.close()
+            self._file = None
 
 
 def unpacking(archive: Path, folder: Path, limits: ArchiveLimits) -> Iterator[None]:
-    """Unpack into ``folder``, and yield after each short piece of work.
+    """Unpack a file that stays as it is, and yield after each short piece of work.
 
-    The caller removes the folder if this raises or is closed before its end.
-
-    Raises BadSequence if the file is not a zip or tar archive, is damaged or encrypted, or contains
-    links or names that lead out of the folder. Raises UploadTooLarge if it has more files, bytes or
-    compression than ``limits`` allow, and InsufficientStorage if the disk has no room for it.
+    The caller removes ``folder`` if this raises or is closed before its end. Raises what
+    :class:`ArchiveUnpacker` does.
     """
+    budget = ArchiveBudget(limits, free_bytes(folder))
+    budget.take_archive(archive.stat().st_size)
+    budget.complete()
     with archive.open("rb") as file:
-        start = file.read(8)
-    allowed = min(limits.max_unpacked_bytes, round(limits.max_ratio * archive.stat().st_size))
-    budget = _Budget(limits, allowed, free_bytes(folder))
-    members = _zip_members if start.startswith(_ZIP_START) else _tar_members
+        if file.read(len(_ZIP_START)) == _ZIP_START:
+            yield from _unpacking_zip(archive, folder, budget, consume=False)
+            return
+        file.seek(0)
+        tar = TarUnpacker(folder, budget)
+        try:
+            with _damage_refused():
+                while chunk := file.read(_CHUNK):
+                    tar.feed(chunk)
+                    yield
+                tar.end()
+        finally:
+            tar.close()
+
+
+@contextmanager
+def _damage_refused() -> Iterator[None]:
+    """Raise BadSequence for what the standard library says about a damaged archive."""
     try:
-        for member in members(archive, start, budget):
-            budget.take_file(member)
-            path = _target_path(folder, member.name)
-            if all(map(is_data, path.relative_to(folder).parts)):
-                yield from _writing(member, path, budget)
+        yield
     except _DAMAGED as error:
         raise BadSequence(f"expected a complete zip or tar archive: {error}") from None
     except OSError as error:
@@ -100,105 +144,39 @@ def unpacking(archive: Path, folder: Path, limits: ArchiveLimits) -> Iterator[No
         raise BadSequence("expected a complete zip or tar archive: an offset is wrong") from None
 
 
-class _Budget:
-    """Counts files and bytes against the limits."""
-
-    def __init__(self, limits: ArchiveLimits, allowed_bytes: int, free_bytes: int) -> None:
-        self._limits = limits
-        self.max_files = limits.max_files
-        self._free_bytes = free_bytes
-        self._files = 0
-        self._headers = 0
-        self._bytes = 0
-        self._allowed_bytes = allowed_bytes
-
-    def take_file(self, member: _Member) -> None:
-        self._files += 1
-        self._bytes += _NAME_BYTES
-        self.check_files(self._files)
-        self._check(self._bytes + member.declared_bytes)
-
-    def check_all(self, members: Sequence[_Member]) -> None:
-        """Check all members at once, where an archive lists them, before any is written."""
-        self.check_files(len(members))
-        self._check(sum(_NAME_BYTES + member.declared_bytes for member in members))
-
-    def check_files(self, count: int) -> None:
-        if count > self._limits.max_files:
-            raise UploadTooLarge(
-                f"expected at most {self._limits.max_files} files in the archive; the server's "
-                "setting batch.max_files allows more"
-            )
-
-    def take_header(self) -> None:
-        """Count a member of any kind, also a folder."""
-        self._headers += 1
-        self.check_files(self._headers // 2)  # as many folders as files
-
-    def limited(self, file: BinaryIO | BufferedIOBase, *, at_once: int) -> IO[bytes]:
-        """Return the archive for the standard library to read, within the limits."""
-        headers = max(_LEAST_DIRECTORY, self._limits.max_files * 2 * _NAME_BYTES)
-        return limited_reads(file, at_once=at_once, together=self._allowed_bytes + headers)
-
-    def take_bytes(self, count: int) -> None:
-        self._bytes += count
-        self._check(self._bytes)
-
-    def _check(self, count: int) -> None:
-        if count > self._free_bytes:
-            raise InsufficientStorage(
-                f"the archive needs {count} bytes or more on the disk, and {self._free_bytes} are "
-                "free; delete results, or make room on the server"
-            )
-        if count > self._allowed_bytes:
-            raise UploadTooLarge(
-                f"the archive unpacks to more than {self._allowed_bytes} bytes; the limit "
-                f"is {self._limits.max_unpacked_bytes}, and {self._limits.max_ratio:g} times the "
-                "archive's size (the server's settings batch.max_unpacked_mib and batch.max_ratio)"
-            )
-
-
-def _target_path(folder: Path, name: str) -> Path:
-    """Return the path to unpack a member to. Raises BadSequence if it is not below ``folder``."""
-    path = PurePosixPath(name)
-    parts = [part for part in path.parts if part != "."]
-    bad = not parts or path.is_absolute() or len(name) > _LONGEST_NAME
-    if bad or any(map(_is_bad_part, parts)):
-        raise BadSequence(f"expected names below the archive's own folder, got {name[:100]!r}")
-    return folder.joinpath(*parts)
-
-
-def _is_bad_part(part: str) -> bool:
-    too_long = len(part.encode()) > _LONGEST_PART_BYTES
-    return too_long or part == ".." or not set(part).isdisjoint(_NOT_IN_NAMES)
-
-
-def _writing(member: _Member, path: Path, budget: _Budget) -> Iterator[None]:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with member.open() as source, path.open("xb") as target:
-            while chunk := source.read(_CHUNK):
-                budget.take_bytes(len(chunk))
-                target.write(chunk)
-                yield
-        yield
-    except (FileExistsError, NotADirectoryError, IsADirectoryError):
-        raise BadSequence(f"the archive contains {member.name!r} twice") from None
-
-
-def _zip_members(archive: Path, start: bytes, budget: _Budget) -> Iterator[_Member]:
+def _unpacking_zip(
+    archive: Path, folder: Path, budget: ArchiveBudget, *, consume: bool
+) -> Iterator[None]:
     # zipfile reads the whole directory at once, and makes an object of each entry.
     directory = max(_LEAST_DIRECTORY, budget.max_files * _ENTRY_BYTES)
+    budget.complete()
+    headers = max(_LEAST_DIRECTORY, budget.max_files * 2 * NAME_BYTES)
+    together = budget.allowed_bytes + headers
     with (
+        _damage_refused(),
         archive.open("rb") as opened,
-        zipfile.ZipFile(budget.limited(opened, at_once=directory)) as file,
+        zipfile.ZipFile(limited_reads(opened, at_once=directory, together=together)) as file,
     ):
-        listed = list(_listed(file))
-        budget.check_all(listed)
-        yield from listed
+        members = dict(_listed(file))
+        budget.check_files(len(members))
+        budget.check_bytes(sum(NAME_BYTES + info.file_size for info in members))
+        for info, name in sorted(
+            members.items(), key=lambda each: each[0].header_offset, reverse=consume
+        ):
+            budget.take_file(info.file_size)
+            path = target_path(folder, name)
+            if all(map(is_data, path.relative_to(folder).parts)):
+                with new_file(path, name) as target, file.open(info) as source:
+                    while chunk := source.read(_CHUNK):
+                        budget.take_bytes(len(chunk))
+                        target.write(chunk)
+                        yield
+            if consume:
+                os.truncate(archive, info.header_offset)
+            yield
 
 
-def _listed(file: zipfile.ZipFile) -> Iterator[_Member]:
+def _listed(file: zipfile.ZipFile) -> Iterator[tuple[zipfile.ZipInfo, str]]:
     # Some tools of Windows write backslashes where the format says slashes.
     windows = not any("/" in info.filename for info in file.infolist())
     for info in file.infolist():
@@ -210,37 +188,4 @@ def _listed(file: zipfile.ZipFile) -> Iterator[_Member]:
             raise BadSequence(f"expected files and folders only, {info.filename!r} is a link")
         if info.flag_bits & 1:
             raise BadSequence(f"expected an archive without a password: {info.filename!r}")
-        yield _Member(name, info.file_size, _opener(file, info))
-
-
-def _opener(file: zipfile.ZipFile, info: zipfile.ZipInfo) -> Callable[[], IO[bytes]]:
-    return lambda: file.open(info)
-
-
-def _tar_members(archive: Path, start: bytes, budget: _Budget) -> Iterator[_Member]:
-    opened = next(
-        (
-            decompressor(archive)
-            for magic, decompressor in _DECOMPRESSORS.items()
-            if start.startswith(magic)
-        ),
-        None,
-    ) or archive.open("rb")
-    # tarfile reads extended headers of any stated length.
-    with opened, tarfile.open(fileobj=budget.limited(opened, at_once=_CHUNK), mode="r:") as file:
-        while (info := file.next()) is not None:
-            # It remembers all members, with all that their headers say.
-            file.members.clear()  # type: ignore[attr-defined] # not in its stubs
-            budget.take_header()
-            if info.isdir():
-                continue
-            content = file.extractfile(info) if info.isreg() and not info.issparse() else None
-            if content is None:
-                raise BadSequence(f"expected files and folders only, {info.name!r} is neither")
-            # Bytes of another encoding: names that nobody looks for need not be text.
-            name = info.name.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
-            yield _Member(name, info.size, _same(content))
-
-
-def _same(content: IO[bytes]) -> Callable[[], IO[bytes]]:
-    return lambda: content
+        yield info, name

@@ -52,8 +52,8 @@ class QueueLimits:
     waiting_per_principal: int  # most of one principal that has shown a credential
     checkpoint_s: float  # seconds of work that a crash may cost
     keep_s: float  # time that ended jobs are kept
-    disk_bytes: int  # disk space
-    principal_bytes: int  # the same of one principal that has shown a credential
+    disk_bytes: int | None  # disk space; None: follows the free space
+    principal_bytes: int | None  # of one principal that has shown a credential; None: half of it
     webhook_hosts: Sequence[str] = ()  # hosts that webhooks may go to
     inputs: Sequence[str] = ()  # NAME=PATH of folders that jobs may read
 

@@ -5,7 +5,7 @@ from vergence_service.access.principals import Principal
 from vergence_service.jobs.job import Job
 from vergence_service.jobs.kept_uploads import KeptUploads
 from vergence_service.jobs.registry import JobRegistry
-from vergence_service.jobs.storage import check_free
+from vergence_service.jobs.storage import check_free, free_bytes
 from vergence_service.jobs.store import JobStore
 from vergence_service.threads import ThreadPool
 
@@ -13,7 +13,8 @@ from vergence_service.threads import ThreadPool
 class DiskRoom:
     """Compares what is needed with the limits of all jobs and of a principal, and with the disk.
 
-    The limit of a principal is for those that have shown a credential.
+    The limit of a principal is for those that have shown a credential. Where none is set, all jobs
+    together may use the whole disk, and a principal half of what is free and of what they use.
     """
 
     def __init__(
@@ -22,8 +23,8 @@ class DiskRoom:
         jobs: JobRegistry,
         uploads: KeptUploads,
         *,
-        disk_bytes: int,
-        principal_bytes: int,
+        disk_bytes: int | None,
+        principal_bytes: int | None,
         background: ThreadPool,
     ) -> None:
         self._store = store
@@ -69,9 +70,10 @@ class DiskRoom:
         await self.check_free(new.result_bytes, what="the result of the sequence")
 
     async def _check_limit(self, needed: int, owner: Principal, *, what: str, upload: str) -> None:
-        if needed > self._disk_bytes:
+        limit = self._disk_bytes
+        if limit is not None and needed > limit:
             raise UploadTooLarge(
-                f"{what} need {needed} bytes, the server keeps {self._disk_bytes} for all "
+                f"{what} need {needed} bytes, the server keeps {limit} for all "
                 "sequences; send it in parts, or start the server with a larger batch.disk_mib"
             )
         await self._jobs.expire()
@@ -79,24 +81,37 @@ class DiskRoom:
             await self._check_principal(needed, owner, what=what, upload=upload)
         held = await self._background.run(self._uploads.held_bytes, upload)
         used = self._jobs.used_bytes() + held
-        if used + needed > self._disk_bytes:
+        if limit is not None and used + needed > limit:
             raise QueueFull(
-                f"sequences, their results and uploads use {used} of {self._disk_bytes} bytes on "
+                f"sequences, their results and uploads use {used} of {limit} bytes on "
                 f"disk, {what} need {needed}, and no result is deleted before it expires; fetch "
                 "and delete results, or try again later (the server's settings batch.disk_mib, "
                 "batch.keep_h)",
                 retry_after_s=self._jobs.room_in_s(),
             )
 
+    async def _room(self) -> int:
+        """Return the space for all jobs and uploads together, used or free."""
+        if self._disk_bytes is not None:
+            return self._disk_bytes
+        free = await self._background.run(free_bytes, self._store.directory)
+        held = await self._background.run(self._uploads.held_bytes, "")
+        missing = await self._background.run(self._uploads.missing_bytes)
+        written = self._jobs.used_bytes() - self._jobs.promised_bytes() + held - missing
+        return free + written
+
     async def _check_principal(
         self, needed: int, owner: Principal, *, what: str, upload: str
     ) -> None:
+        limit = self._principal_bytes
+        if limit is None:
+            limit = await self._room() // 2
         held = await self._background.run(self._uploads.held_bytes, upload, owner.name)
         used = self._jobs.used_bytes(owner=owner.name) + held
-        if used + needed > self._principal_bytes:
+        if used + needed > limit:
             raise Quota(
                 f"sequences, results and uploads of {owner.name} use {used} bytes on disk, {what} "
-                f"need {needed}, and the limit of one principal is {self._principal_bytes}; fetch "
+                f"need {needed}, and the limit of one principal is {limit}; fetch "
                 "and delete results, or try again later (the server's setting "
                 "limits.sequences_mib)",
                 retry_after_s=self._jobs.room_in_s(),

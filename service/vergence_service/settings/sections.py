@@ -218,9 +218,10 @@ class LimitSettings(Section):
     waiting_sequences: PositiveInt = Field(
         default=8, description="most unfinished sequences of one principal"
     )
-    sequences_mib: PositiveInt = Field(
-        default=10_240,
-        description="disk space of all uploads, sequences and results of one principal",
+    sequences_mib: PositiveInt | None = Field(
+        default=None,
+        description="disk space of all uploads, sequences and results of one principal; default: "
+        "half of what all may use",
     )
     streams_per_client: PositiveInt | None = Field(
         default=None,
@@ -273,9 +274,16 @@ class BatchSettings(Section):
     keep_h: PositiveFloat = Field(
         default=24.0, description="hours that results are kept, fetched or not"
     )
-    disk_mib: PositiveInt = Field(default=20_480, description="disk space of all jobs together")
-    max_upload_mib: PositiveInt = Field(default=4096, description="largest upload")
-    max_unpacked_mib: PositiveInt = Field(default=8192, description="largest unpacked archive")
+    disk_mib: PositiveInt | None = Field(
+        default=None, description="disk space of all jobs together; default: the whole disk"
+    )
+    max_upload_mib: PositiveInt | None = Field(
+        default=None,
+        description="largest upload; default: what is free when the server starts",
+    )
+    max_unpacked_mib: PositiveInt | None = Field(
+        default=None, description="largest unpacked archive; default: as for uploads"
+    )
     max_files: PositiveInt = Field(default=100_000, description="most files in one upload")
     max_ratio: PositiveFloat = Field(
         default=100.0, description="largest ratio of unpacked size to uploaded size"

@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator, Iterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO
+from typing import Annotated, Any
 
 from fastapi import Request
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
@@ -21,7 +21,8 @@ from starlette.requests import ClientDisconnect
 from vergence_proto.codec.image_files import ImageKind, image_kind
 from vergence_proto.errors import BadSequence, UploadTooLarge
 from vergence_proto.text import decoded_text
-from vergence_service.jobs.archives import ArchiveLimits, unpacking
+from vergence_service.jobs.archive_limits import ArchiveLimits
+from vergence_service.jobs.archives import ArchiveUnpacker, unpacking
 from vergence_service.jobs.kept_uploads import KeptUpload
 from vergence_service.threads import ThreadPool
 from vergence_service.transports.http.bodies import body_of
@@ -154,12 +155,15 @@ async def receive_sequence(
         async with while_connected(request):
             await threads.finish(_arranging(parts, folder, limits))
     elif kind in ARCHIVE_TYPES:
-        archive = folder / "archive"
-        with archive.open("wb") as file:
+        await threads.run((folder / "input").mkdir)
+        unpacker = ArchiveUnpacker(folder / "input", folder / "archive", limits.archive)
+        try:
             async for chunk in body_chunks(request, limits):
-                await threads.run(_write, file, chunk, digest)
-        async with while_connected(request):
-            await threads.finish(_unpacking(archive, folder, limits))
+                await threads.run(_take, unpacker, chunk, digest)
+            async with while_connected(request):
+                await threads.finish(unpacker.finishing())
+        finally:
+            await threads.run(unpacker.close)
     else:
         raise BadSequence(
             f"expected a body of {FORM_TYPE} or {', '.join(ARCHIVE_TYPES)}, got {kind!r}"
@@ -202,8 +206,8 @@ async def digest_of(request: Request, limits: UploadLimits, threads: ThreadPool)
     return digest.hexdigest()
 
 
-def _write(file: BinaryIO, chunk: bytes, digest: "hashlib._Hash") -> None:
-    file.write(chunk)
+def _take(unpacker: ArchiveUnpacker, chunk: bytes, digest: "hashlib._Hash") -> None:
+    unpacker.feed(chunk)
     digest.update(chunk)
 
 
