@@ -4,7 +4,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Literal
 
-Extra = Literal["bench", "cli", "fleet", "models", "ray", "record", "server", "train", "zenoh"]
+Extra = Literal[
+    "bench", "cli", "fleet", "models", "otel", "ray", "record", "server", "train", "zenoh"
+]
 
 
 def how_to_install(extra: Extra | None) -> str:

@@ -36,7 +36,7 @@ class Connection:
     """An attachment that records its notices and its end."""
 
     transport = "grpc"
-    trace_id = ""
+    trace_parent = None
 
     def __init__(self, clock: ManualClock) -> None:
         self.notices: list[Notice] = []

@@ -3,7 +3,7 @@
 import asyncio
 import time
 from collections.abc import AsyncIterator, Callable, Coroutine
-from contextlib import asynccontextmanager, closing, nullcontext
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, closing, nullcontext
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
@@ -43,6 +43,7 @@ from vergence_service.streams.table import StreamTable
 from vergence_service.streams.turns import Turns
 from vergence_service.threads import Threads
 from vergence_service.transports.addresses import format_address
+from vergence_service.transports.errors import ExtraMissing
 from vergence_service.transports.grpc.inference_protocol import InferenceServicer
 from vergence_service.transports.grpc.server import DepthServicer, GrpcServer
 from vergence_service.transports.http.app import HttpServer
@@ -97,9 +98,9 @@ async def running(
     """Run a server; it serves until the end of the block.
 
     Raises SettingsError if strangers could reach it or its tokens or certificate cannot be read,
-    PortTaken if a port is in use, ExtraMissing if Zenoh or Redis is not installed, ZenohUnreachable
-    if its network cannot be joined, and ManifestError or ProviderUnavailable if the model cannot
-    be loaded.
+    PortTaken if a port is in use, ExtraMissing if an optional package is not installed,
+    ZenohUnreachable if its network cannot be joined, and ManifestError or ProviderUnavailable if
+    the model cannot be loaded.
     """
     check_exposure(settings)
     gate, certificate = make_gate(settings), make_certificate(settings)
@@ -203,6 +204,7 @@ async def running(
     # The outermost context ends last: no transport outlives the batcher that it uses.
     async with (
         threads,
+        _traces(settings, engine),
         snapshots or nullcontext(),
         batcher,
         GrpcServer(
@@ -302,6 +304,16 @@ async def drain(server: Running, *, within_s: float) -> None:
         tasks.create_task(server.http.drain(within_s=within_s))
         if server.zenoh is not None:
             tasks.create_task(server.zenoh.server.drain(within_s=within_s))
+
+
+def _traces(settings: Settings, engine: DepthEngine) -> AbstractAsyncContextManager[None]:
+    if not settings.server.traces:
+        return nullcontext()
+    try:
+        from vergence_service.app.traces import span_per_frame
+    except ModuleNotFoundError:
+        raise ExtraMissing("OpenTelemetry", "otel") from None
+    return span_per_frame(engine)
 
 
 async def _load_rest(engine: DepthEngine, jobs: JobQueue | None) -> None:

@@ -15,6 +15,11 @@ class ServerSettings(Section):
     drain_s: PositiveFloat = Field(
         default=5.0, description="time that clients have to leave when the server shuts down"
     )
+    traces: bool = Field(
+        default=False,
+        description="export a span per frame by OpenTelemetry, whose OTEL_* variables say where "
+        "to (needs the extra otel)",
+    )
 
 
 class GrpcSettings(Section):

@@ -37,6 +37,7 @@ from vergence_service.streams.resuming import StreamResumer
 from vergence_service.streams.search_window import SearchReach
 from vergence_service.streams.stream import Attachment, Notice, NoticeKind, Stream, StreamConfig
 from vergence_service.streams.table import StreamTable
+from vergence_service.streams.traces import FrameTraces
 from vergence_service.streams.turns import Turns
 from vergence_service.streams.viewers import Viewers
 from vergence_service.threads import Cost, Threads
@@ -86,6 +87,7 @@ class DepthEngine:
         self.metrics = metrics
         self.threads = threads
         self.viewers = Viewers()
+        self.traces: FrameTraces | None = None
         self._batcher = batcher
         self._model = model
         self._sizes = sizes
@@ -235,11 +237,14 @@ class DepthEngine:
         self.streams.touch(stream)
         decoded = partial(self.threads.live.run, cost.of, decoded_view, decode, stream)
         try:
-            return await self._step(
+            stepped = await self._step(
                 stream, decoded, arrived_s=arrived_s, cost=cost, max_age_s=max_age_s
             )
         finally:
             self.streams.touch(stream)  # a step may take longer than the idle timeout
+        if self.traces is not None:
+            self.traces.add(stepped, age_s=self._clock() - arrived_s)
+        return stepped
 
     async def check_offline(self, config: StreamConfig) -> None:
         """Refuse what :meth:`offline` would refuse, with the same errors."""

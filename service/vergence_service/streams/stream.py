@@ -31,6 +31,15 @@ class Notice:
     in_s: float  # time until it happens
 
 
+@dataclass(frozen=True, slots=True)
+class TraceParent:
+    """A span of a client, in hexadecimal digits (W3C Trace Context)."""
+
+    trace_id: str  # 32
+    span_id: str  # 16
+    flags: str  # 2
+
+
 class Attachment(Protocol):
     """The connection that uses a stream. Its methods must neither block nor raise."""
 
@@ -40,8 +49,8 @@ class Attachment(Protocol):
         ...
 
     @property
-    def trace_id(self) -> str:
-        """The id of the client's trace, for the log; empty: none."""
+    def trace_parent(self) -> TraceParent | None:
+        """The span of the client that opened the connection; None: not known."""
         ...
 
     @property
@@ -110,7 +119,7 @@ class Stream:
     warned: bool = False  # the client knows that the stream will expire
     turn: asyncio.Lock = field(default_factory=asyncio.Lock)
     owner: Principal = LOCAL
-    trace_id: str = ""
+    trace_parent: TraceParent | None = None
     transport: str = ""  # over which the client is attached
     # For administrators: when the last frames were stepped and how old they were then, in seconds.
     answers: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=512))

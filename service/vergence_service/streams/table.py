@@ -181,7 +181,7 @@ class StreamTable:
             self._clock(),
             owner=place.owner,
             transport=attachment.transport if attachment else "",
-            trace_id=attachment.trace_id if attachment else "",
+            trace_parent=attachment.trace_parent if attachment else None,
         )
         self._streams[place.key] = stream
         self._metrics.streams_opened.inc()
@@ -221,7 +221,7 @@ class StreamTable:
             )
         stream.config = config
         stream.attachment = attachment
-        stream.transport, stream.trace_id = attachment.transport, attachment.trace_id
+        stream.transport, stream.trace_parent = attachment.transport, attachment.trace_parent
         stream.client = client  # the client may have changed its network
         stream.owner = owner  # and its token
         if stream.state is not None:
@@ -364,7 +364,7 @@ def _about(stream: Stream) -> dict[str, object]:
         "principal": stream.owner.name,
         "transport": stream.transport,
         "address": stream.client,
-        **({"trace_id": stream.trace_id} if stream.trace_id else {}),
+        **({"trace_id": stream.trace_parent.trace_id} if stream.trace_parent else {}),
     }
 
 

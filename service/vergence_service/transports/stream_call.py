@@ -23,7 +23,7 @@ from vergence_service.streams.conversion import SteppedFrame
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.stream import Notice, Stream
 from vergence_service.threads import Cost
-from vergence_service.transports.callers import TRACE_ID
+from vergence_service.transports.callers import TRACE_PARENT
 from vergence_service.transports.displaced import DisplacedFrames
 from vergence_service.transports.mailbox import Mailbox, QueuedFrame
 from vergence_service.transports.opening import stream_config
@@ -81,7 +81,7 @@ class DepthCall:
         self._client = client
         self._caller = caller
         self.transport = transport
-        self.trace_id = TRACE_ID.get()
+        self.trace_parent = TRACE_PARENT.get()
         self._limits = limits
         self._clock = clock
         self._outbox = Outbox(

@@ -8,7 +8,8 @@ from typing import Any
 import grpc
 
 from vergence_service.access.gate import Gate
-from vergence_service.transports.callers import CALLER, TRACE_ID, trace_id_of
+from vergence_service.streams.stream import TraceParent
+from vergence_service.transports.callers import CALLER, TRACE_PARENT, trace_parent_of
 from vergence_service.transports.grpc.errors import Context, errors_as_status
 
 # A load balancer asks for the health without a credential.
@@ -33,12 +34,12 @@ class Identity(grpc.aio.ServerInterceptor):  # type: ignore[type-arg] # of its s
             return handler
         metadata = dict(handler_call_details.invocation_metadata or ())
         authorization = _text(metadata.get("authorization"))
-        trace_id = trace_id_of(_text(metadata.get("traceparent")))
+        parent = trace_parent_of(_text(metadata.get("traceparent")))
         changed = {
             kind: self._behind(
                 behaviour,
                 authorization,
-                trace_id,
+                parent,
                 handler_call_details.method.startswith(_ADMINISTRATIVE),
             )
             for kind in ("unary_unary", "unary_stream", "stream_unary", "stream_stream")
@@ -50,16 +51,16 @@ class Identity(grpc.aio.ServerInterceptor):  # type: ignore[type-arg] # of its s
         self,
         behaviour: Callable[..., Any],
         authorization: str | None,
-        trace_id: str,
+        parent: TraceParent | None,
         administrative: bool,
     ) -> Any:
         async def answer(request: Any, context: Context) -> Any:
-            TRACE_ID.set(trace_id)
+            TRACE_PARENT.set(parent)
             async with self._admitted(context, authorization, administrative):
                 return await behaviour(request, context)
 
         async def answers(request: Any, context: Context) -> AsyncIterator[Any]:
-            TRACE_ID.set(trace_id)
+            TRACE_PARENT.set(parent)
             async with self._admitted(context, authorization, administrative):
                 async for each in behaviour(request, context):
                     yield each

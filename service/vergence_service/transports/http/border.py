@@ -19,7 +19,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from vergence_proto.errors import BadShape, DepthError, Forbidden
 from vergence_proto.http_records import PROTOBUF_TYPE, RECORDS_TYPE
 from vergence_service.access.gate import Gate
-from vergence_service.transports.callers import CALLER, TRACE_ID, trace_id_of
+from vergence_service.transports.callers import CALLER, TRACE_PARENT, trace_parent_of
 from vergence_service.transports.http.admin import LOGIN, Logins
 from vergence_service.transports.http.errors import refusal_of
 
@@ -142,7 +142,7 @@ class Border:
         caller = self._gate.caller(authorization, names)
         request.enter_context(self._gate.requests.of(caller))
         CALLER.set(caller)
-        TRACE_ID.set(trace_id_of(headers.get("traceparent")))
+        TRACE_PARENT.set(trace_parent_of(headers.get("traceparent")))
         if scope["method"] == "POST" and scope["path"].startswith(_PROTOBUF_PATHS):
             kind = headers.get("content-type", "").partition(";")[0].strip().lower()
             call = scope["path"].startswith(_CALL_PATHS)
