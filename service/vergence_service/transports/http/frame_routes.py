@@ -25,6 +25,7 @@ from vergence_service.threads import ThreadPool
 from vergence_service.transports.callers import CALLER
 from vergence_service.transports.http.errors import PROBLEM_RESPONSE
 from vergence_service.transports.http.ranges import ranged
+from vergence_service.transports.http.uploads import ANY_TYPE
 
 NDJSON = "application/x-ndjson"
 _MAP_FORMATS = {
@@ -98,7 +99,7 @@ def frame_routes(jobs: JobRegistry, threads: ThreadPool, stopping: asyncio.Event
             200: {
                 "description": "One line of JSON per frame, in order, as in frames.jsonl; none: no "
                 "frame was done in time. `Vergence-Ended: true` says that no other will follow.",
-                "content": {NDJSON: {"schema": {"type": "string"}}},
+                "content": {NDJSON: {"schema": {"type": "string"}}, ANY_TYPE: _BYTES},
             }
         },
     )
@@ -130,7 +131,7 @@ def frame_routes(jobs: JobRegistry, threads: ThreadPool, stopping: asyncio.Event
             200: {
                 "description": "A line of JSON, then a DisparityMap of depth.proto and the left "
                 "image, if the job kept it; see vergence_proto/job_results/frame_file.py",
-                "content": {MEDIA_TYPE: _BYTES},
+                "content": {MEDIA_TYPE: _BYTES, ANY_TYPE: _BYTES},
             },
             304: {"description": "The frame is the one that If-None-Match names"},
         },
@@ -150,7 +151,7 @@ def frame_routes(jobs: JobRegistry, threads: ThreadPool, stopping: asyncio.Event
                 "description": "A file, as in the archives",
                 "content": {
                     **dict.fromkeys(_MEDIA_TYPES.values(), _BYTES),
-                    "application/octet-stream": _BYTES,
+                    ANY_TYPE: _BYTES,
                 },
             },
             304: {"description": "The file is the one that If-None-Match names"},
@@ -162,7 +163,7 @@ def frame_routes(jobs: JobRegistry, threads: ThreadPool, stopping: asyncio.Event
         data = await _content(threads, status, folder, index)
         name, content = await threads.run(_file_of, data, folder, file, status)
         suffix = name.rpartition(".")[2]
-        media_type = _MEDIA_TYPES.get(suffix, "application/octet-stream")
+        media_type = _MEDIA_TYPES.get(suffix, ANY_TYPE)
         return _tagged(request, content, zlib.crc32(data), media_type)
 
     return router

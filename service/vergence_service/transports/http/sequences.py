@@ -33,6 +33,7 @@ from vergence_service.transports.http.sequence_models import (
 )
 from vergence_service.transports.http.tus import tus_routes
 from vergence_service.transports.http.uploads import (
+    ANY_TYPE,
     ARCHIVE_TYPES,
     FORM_TYPE,
     UploadLimits,
@@ -48,11 +49,15 @@ _SILENCE_S = 15.0
 
 _FILE = {"type": "string", "format": "binary"}
 _BINARY = {"schema": _FILE}
+# A client that was generated takes the first type that it knows: bytes, and not text.
+_ARCHIVE_OR_FILM = {"application/zip": _BINARY, "video/mp4": _BINARY, ANY_TYPE: _BINARY}
 _UPLOAD: dict[str, Any] = {
     "requestBody": {
         "required": True,
+        "description": f"An archive, of one of the types {', '.join(ARCHIVE_TYPES)}; or a form",
         "content": {
-            **dict.fromkeys(ARCHIVE_TYPES, _BINARY),
+            # Generators of clients know this type of bytes; the others are accepted too.
+            ANY_TYPE: _BINARY,
             FORM_TYPE: {
                 "schema": {
                     "type": "object",
@@ -71,12 +76,9 @@ _UPLOAD: dict[str, Any] = {
 _RESULT: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "A zip with one file per frame and output; with format=mp4 a film",
-        "content": {"application/zip": _BINARY, "video/mp4": _BINARY},
+        "content": _ARCHIVE_OR_FILM,
     },
-    206: {
-        "description": "The part that `Range` asks for",
-        "content": {"application/zip": _BINARY, "video/mp4": _BINARY},
-    },
+    206: {"description": "The part that `Range` asks for", "content": _ARCHIVE_OR_FILM},
 }
 _ACCEPTED: dict[int | str, dict[str, Any]] = {
     202: {

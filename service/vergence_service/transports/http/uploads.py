@@ -29,6 +29,7 @@ from vergence_service.transports.http.bodies import body_of
 from vergence_service.transports.http.forms import FormPart, FormWriter
 
 FORM_TYPE = "multipart/form-data"
+ANY_TYPE = "application/octet-stream"
 ARCHIVE_TYPES = (
     "application/zip",
     "application/x-zip-compressed",
@@ -37,7 +38,7 @@ ARCHIVE_TYPES = (
     "application/x-gtar",
     "application/x-xz",
     "application/x-bzip2",
-    "application/octet-stream",
+    ANY_TYPE,
 )
 _DIGESTED = 1 << 20
 _LARGEST_JSON = 8 << 20  # its numbers take a dozen times the memory
