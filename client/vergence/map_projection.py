@@ -26,6 +26,7 @@ _TRIES = 8
 # Pixels that are looked up at a time.
 _CHUNK = 20_000
 _CORNERS = np.ones((2, 2), np.uint8)
+_AROUND = np.ones((3, 3), np.uint8)
 
 
 class Found(NamedTuple):
@@ -48,10 +49,11 @@ class Projection:
     age_s: float
     motion_m: float  # how far things may have moved since
 
-    def splat(self, rows: int, columns: int) -> Plane:
+    def splat(self, rows: int, columns: int, *, wanted: Mask | None = None) -> Plane:
         """Forward-project every second pixel onto every second pixel of the view.
 
-        Returns the nearest surface as float32 [rows, columns], 1 / metres; 0: none.
+        Returns the nearest surface as float32 [rows, columns], 1 / metres; 0: none. Away from the
+        ``wanted`` pixels it may be 0.
         """
         import cv2  # here: loading it takes longer than the rest of the client
 
@@ -78,7 +80,14 @@ class Projection:
                 np.clip(plane, 0, limit, out=plane)
                 index *= np.int32(padded)
                 index += plane.astype(np.int32)
-        nearest = _greatest(index[seen], q[seen], (rows + 2) * padded).reshape(rows + 2, padded)
+        if wanted is not None:
+            around = cv2.dilate(wanted.view(np.uint8), _AROUND)
+            framed = cv2.copyMakeBorder(around, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=(0,))
+            # The index of a point that is not seen is arbitrary.
+            seen &= framed.reshape(-1).take(index, mode="clip").view(np.bool_)
+        points = np.flatnonzero(seen)
+        index, q = index.reshape(-1).take(points), q.reshape(-1).take(points)
+        nearest = _greatest(index, q, (rows + 2) * padded).reshape(rows + 2, padded)
         # Each point lies between four pixels of the view, and is seen in all of them.
         nearest = np.asarray(cv2.dilate(nearest, _CORNERS, anchor=(1, 1)), np.float32)
         return np.ascontiguousarray(nearest[1 : rows + 1, 1 : columns + 1])
@@ -143,7 +152,8 @@ class Projection:
             read = cv2.remap(self.disparity_px, u, v, cv2.INTER_NEAREST, borderValue=outside)
             smooth = cv2.remap(self.disparity_px, u, v, cv2.INTER_LINEAR, borderValue=outside)
             np.abs(np.subtract(smooth, read, out=scratch), out=scratch)
-            np.copyto(read, smooth, where=scratch < EDGE_PX)  # false for NaN
+            # Copies with a mask are many times faster in OpenCV than in numpy.
+            cv2.copyTo(smooth, (scratch < EDGE_PX).view(np.uint8), read)  # false for NaN
             # With the disparity of the guess, d / w, it goes forward to (x, y, guess, 1) / w: only
             # the change of the disparity has to be added.
             useful = (read > 0) & (guess > 0) & (w > 0)
@@ -162,10 +172,9 @@ class Projection:
             np.less(change, scale * _MISS_PX, out=found.covered)
             np.logical_and(found.covered, useful, out=found.covered)
             # Of two surfaces neither of which is seen there, the farther one is more likely.
-            refined = np.minimum(q, guess, out=d)
-            np.copyto(refined, guess, where=~useful)
-            np.copyto(refined, q, where=found.covered)
-            found.inverse_depth[:] = refined
+            refined = np.minimum(q, guess, out=found.inverse_depth)
+            cv2.copyTo(guess, (~useful).view(np.uint8), refined)
+            cv2.copyTo(q, found.covered.view(np.uint8), refined)
             if self.sigma_px is None or found.sigma is None:
                 return
             read = cv2.remap(self.sigma_px, u, v, cv2.INTER_NEAREST, borderValue=(0.0,))
@@ -205,12 +214,13 @@ def _greatest(
     one are written again, which is many times faster than a sort of all.
     """
     greatest = np.zeros(size, np.float32)
+    places = index.astype(np.intp)  # once: an array of int32 is converted at each use
     for _ in range(_TRIES):
-        greatest[index] = values
-        lost = np.flatnonzero(values > greatest[index])
+        greatest[places] = values
+        lost = np.flatnonzero(values > greatest.take(places))
         if not lost.size:
             return greatest
-        index, values = index[lost], values[lost]
+        places, values = places.take(lost), values.take(lost)
     order = np.argsort(values)
-    greatest[index[order]] = values[order]
+    greatest[places[order]] = values[order]
     return greatest

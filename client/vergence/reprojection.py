@@ -199,12 +199,13 @@ def reproject(
 
     depth_m, covered, sigma = seen  # each step is made in place: memory that is new is slow
     known = depth_m > 0 if fill == "far" else covered
-    np.copyto(depth_m, np.float32(np.nan), where=~known)
+    depth_m.reshape(-1)[np.flatnonzero(~known)] = np.nan
     np.reciprocal(depth_m, out=depth_m)
     if sigma is not None:  # the error of 1 / q is that of q by q squared; what is filled is unknown
         sigma *= depth_m
         sigma *= depth_m
-        np.copyto(sigma, depth_m, where=~covered)
+        unseen = np.flatnonzero(~covered)
+        sigma.reshape(-1)[unseen] = depth_m.reshape(-1)[unseen]
     return DepthView(view, world_from_view, depth_m, covered, sigma, maps[0].age_s, result.frame_id)
 
 
@@ -246,27 +247,42 @@ def _seen_on_grid(maps: Sequence[Projection], view: View, grid: int) -> Found:
     rows, columns = -(-view.height // STEP), -(-view.width // STEP)
     size = (view.height, view.width) if grid == 1 else (rows, columns)
     x, y = (np.arange(length, dtype=np.float32) * grid + (grid - 1) / 2 for length in size[::-1])
-    x, y = x[None, :], y[:, None]
-    seen: Found | None = None
-    for source in maps:
-        guess = source.splat(rows, columns)
-        if grid == 1:
-            guess = repeated(guess)[: view.height, : view.width]
-        if seen is None:
-            seen = source.look_up(x, y, guess)
+    newest, *keyframes = maps
+    guess = _on_grid(newest.splat(rows, columns), size)
+    seen = newest.look_up(x[None, :], y[:, None], guess)
+    for source in keyframes:
+        open_to_it = ~seen.covered
+        guess = _on_grid(source.splat(rows, columns, wanted=_halved(open_to_it, grid)), size)
+        pixels = np.flatnonzero((guess > 0) & open_to_it)
+        if not pixels.size:
             continue
-        pixels = np.nonzero((guess > 0) & ~seen.covered)
-        if not pixels[0].size:
-            continue
-        row, column = pixels
-        found = source.look_up(x.T[column], y[row], guess[pixels][:, None])
-        seen.inverse_depth[pixels] = found.inverse_depth[:, 0]
-        seen.covered[pixels] = found.covered[:, 0]
+        row, column = np.divmod(pixels, size[1])
+        listed = guess.reshape(-1)[pixels, None]
+        found = source.look_up(x[column, None], y[row, None], listed)
+        seen.inverse_depth.reshape(-1)[pixels] = found.inverse_depth[:, 0]
+        seen.covered.reshape(-1)[pixels] = found.covered[:, 0]
         if seen.sigma is not None:  # a keyframe without sigma says nothing of its errors
             errors = found.inverse_depth if found.sigma is None else found.sigma
-            seen.sigma[pixels] = errors[:, 0]
-    assert seen is not None
+            seen.sigma.reshape(-1)[pixels] = errors[:, 0]
     return seen
+
+
+def _on_grid(half: Plane, size: tuple[int, int]) -> Plane:
+    """Give every pixel of a grid the value of its pixel of the half size."""
+    if half.shape == size:
+        return half
+    return np.ascontiguousarray(repeated(half)[: size[0], : size[1]])
+
+
+def _halved(full: Mask, grid: int) -> Mask:
+    """Return the pixels of the half size of which any pixel of the grid is true."""
+    if grid != 1:
+        return full
+    height, width = full.shape
+    even = np.zeros((height + height % STEP, width + width % STEP), np.bool_)
+    even[:height, :width] = full
+    rows = even[::STEP] | even[1::STEP]
+    return np.asarray(rows[:, ::STEP] | rows[:, 1::STEP])
 
 
 def _fill_far(inverse_depth: Plane) -> None:
@@ -276,16 +292,17 @@ def _fill_far(inverse_depth: Plane) -> None:
     """
     width = inverse_depth.shape[1]
     flat = inverse_depth.reshape(-1)
-    seen, holes = np.flatnonzero(flat), np.flatnonzero(flat == 0)
-    if not (seen.size and holes.size):
+    holes = np.flatnonzero(flat == 0)
+    if not holes.size:
         return
-    after = holes - np.arange(holes.size)  # as many seen pixels come before each hole
-    far = np.full(holes.size, np.float32(np.inf))
-    for side in (after - 1, after):
-        neighbour = seen[np.clip(side, 0, seen.size - 1)]
-        same_row = neighbour // width == holes // width
-        np.minimum(far, flat[neighbour], out=far, where=same_row)
-    flat[holes] = np.where(np.isfinite(far), far, np.float32(0))
+    # A run of holes begins where the pixel before is none, or is in another row.
+    begins = np.flatnonzero((np.diff(holes, prepend=-2) != 1) | (holes % width == 0))
+    first, last = holes[begins], holes[np.append(begins[1:], holes.size) - 1]
+    far = np.full(first.size, np.float32(np.inf))
+    for neighbour, in_row in ((first - 1, first % width > 0), (last + 1, last % width < width - 1)):
+        np.minimum(far, flat.take(neighbour, mode="clip"), out=far, where=in_row)
+    far[far == np.inf] = 0
+    flat[holes] = np.repeat(far, last - first + 1)
 
 
 def _enlarged(half: Found, edge: np.float32, view: View) -> Found:
@@ -299,7 +316,7 @@ def _enlarged(half: Found, edge: np.float32, view: View) -> Found:
     surface = (highest - lowest < edge) & (lowest > 0)
     # What was seen is not mixed with what was filled.
     surface &= cv2.morphologyEx(covered.view(np.uint8), cv2.MORPH_GRADIENT, _NEIGHBOURS) == 0
-    np.copyto(wide, linear, where=repeated(surface))
+    cv2.copyTo(linear, repeated(np.asarray(surface)).view(np.uint8), wide)
     height, width = view.height, view.width
     return Found(
         np.ascontiguousarray(wide[:height, :width]),
