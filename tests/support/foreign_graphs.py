@@ -62,13 +62,20 @@ class Graph:
         self.constants += constants
         return found
 
-    def model(self, inputs: dict[str, Shape], outputs: dict[str, Shape]) -> ModelProto:
+    def model(
+        self,
+        inputs: dict[str, Shape],
+        outputs: dict[str, Shape],
+        *,
+        takes: int = TensorProto.FLOAT,
+        returns: int = TensorProto.FLOAT,
+    ) -> ModelProto:
         """Opset 13, as most published files."""
         graph = helper.make_graph(
             self.nodes,
             "matcher",
-            [helper.make_tensor_value_info(n, TensorProto.FLOAT, s) for n, s in inputs.items()],
-            [helper.make_tensor_value_info(n, TensorProto.FLOAT, s) for n, s in outputs.items()],
+            [helper.make_tensor_value_info(n, takes, s) for n, s in inputs.items()],
+            [helper.make_tensor_value_info(n, returns, s) for n, s in outputs.items()],
             self.constants,
         )
         opset = [helper.make_opsetid("", 13)]

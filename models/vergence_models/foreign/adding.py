@@ -100,10 +100,17 @@ def _guessed(
     if given.warm_start is True and guess.contract.warm_start is None:
         raise ContractError("the graph has no input for an initial flow, so it starts cold only")
     network = Network(path)
-    contract = outputs_of(guess.contract, network, given)
+    likely = outputs_of(guess.contract, network, given)
+    contract = likely[0]
     if unproven:
         return Added(name, contract, like, None, (), guess.pixels_known)
     proof = prove(contract, network, search_pixels=not guess.pixels_known)
+    for other in likely[1:]:
+        if proof.contract is not None:
+            break
+        tried = prove(other, network, search_pixels=not guess.pixels_known)
+        if tried.contract is not None:
+            contract, proof = other, tried
     wrong = differences(contract, proof)
     # The textures may correct a guess. What the user says is refused if it is wrong.
     guessed = {
@@ -111,6 +118,7 @@ def _guessed(
         "normalisation": given.pixels is None and given.like is None,
         "sign": given.factor is None and given.like is None,
         "scale": given.factor is None and given.like is None,
+        "depth": given.factor is None and given.like is None,
     }
     refused = [each for each in wrong if not guessed.get(each.partition(":")[0], False)]
     if refused or proof.contract is None:

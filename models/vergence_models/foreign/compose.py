@@ -24,6 +24,7 @@ MIRRORED = "mirrored_"  # before those of its second run, on the pair seen in a 
 
 # Sigma where nothing is known, for example left of the second view: the largest that `lite` gives.
 UNSEEN_PX = 27.0
+_LEAST_DEPTH = 1e-6
 # Beyond these, a probability to be right within a pixel gives no finite sigma.
 _CERTAIN = 0.9999
 
@@ -256,14 +257,27 @@ def _disparity_of(
     kind = onnx.helper.np_dtype_to_tensor_dtype(np.dtype(contract.output_dtype))
     inputs[name] = kind, _shape_of(contract.output_layout, prefix)
     plane = _plane_of(graph, name, contract.output_layout, contract.output_channel)
-    if contract.factor != 1:
+    if contract.of_depth:
+        plane = _divisor(graph, plane)
+        plane = graph.add("Div", graph.floats(contract.factor), plane)
+    elif contract.factor != 1:
         plane = graph.add("Mul", plane, graph.floats(contract.factor))
+    if contract.of_width:
+        plane = graph.add("Mul", plane, graph.as_float(graph.dimension(LEFT, 2)))
     if contract.size is not None or contract.output_scale != 1:
         plane, ratio = _at_image_size(graph, plane)
         if contract.size is not None:
             scale = graph.floats(contract.output_scale)
             plane = graph.add("Mul", plane, graph.add("Mul", ratio, scale))
     return plane
+
+
+def _divisor(graph: GraphBuilder, depth: str) -> str:
+    """A depth without zeros; what is closer than any camera sees gets the nearest there is."""
+    least = graph.floats(_LEAST_DEPTH)
+    away = graph.add("Max", graph.add("Abs", depth), least)
+    behind = graph.add("Less", depth, graph.floats(0))
+    return graph.add("Where", behind, graph.add("Neg", away), away)
 
 
 def _sigma_of(

@@ -63,6 +63,8 @@ class Contract:
     output_channel: int = 0
     output_scale: float = 1.0  # width of the output by that of the input
     factor: float = 1.0  # disparity in pixels at the graph's width, for each unit of the output
+    of_depth: bool = False  # the output is a depth: disparity is the factor divided by it
+    of_width: bool = False  # the factor counts widths of the image; only if it has any size
     max_disparity_px: int = 192
     sigma: SigmaFrom = "constant"
     sigma_px: float = 1.0  # the constant; with "left-right", the least sigma
@@ -87,6 +89,11 @@ class Contract:
         """True if a step starts from the disparity of the one before."""
         return self.warm_start is not None and self.warm_start.used
 
+    @property
+    def factor_words(self) -> str:
+        each = f"{self.factor:g}{' x the width of the image' if self.of_width else ''}"
+        return f"{each}, divided by the output, a depth" if self.of_depth else each
+
     def to_json(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
 
@@ -108,7 +115,8 @@ class Contract:
         if self.swapped:
             images += ", the right image first"
         size = "{1}x{0}".format(*self.size) if self.size else f"multiples of {self.multiple_of}"
-        output = f"{self.output} ({self.output_layout})"
+        channel = f", channel {self.output_channel}" if self.output_channel else ""
+        output = f"{self.output} ({self.output_layout}{channel})"
         sigma = {
             "constant": f"{self.sigma_px:g} px everywhere; the graph says none",
             "left-right": "from a second run on mirrored images, at twice the time",
@@ -119,7 +127,7 @@ class Contract:
             ("pixels", f"{self.pixels}, {self.order}{', NHWC' if self.channels_last else ''}"),
             ("size", size),
             ("output", output),
-            ("factor", f"{self.factor:g}"),
+            ("factor", self.factor_words),
             ("range", f"{self.max_disparity_px} px"),
             ("sigma", sigma),
         ]

@@ -30,6 +30,7 @@ _LEFT = re.compile(r"left|(^|[^a-z])l$|[^0-9]1$|_l_|imgl", re.IGNORECASE)
 _FLOW = re.compile(r"flow|init_disp|disp_init|prev", re.IGNORECASE)
 _CONFIDENCE = re.compile(r"conf|certain", re.IGNORECASE)
 _DISPARITY = re.compile(r"disp|flow_up|final|up", re.IGNORECASE)
+_MOST_MAPS = 8  # a graph with more channels returns features or costs
 _SECOND = re.compile(r"second|right|coarse", re.IGNORECASE)
 
 
@@ -105,8 +106,8 @@ def family_of(model: ModelProto, file_name: str, given: Given) -> str | None:
     return given.like or _family_of(model, file_name)
 
 
-def outputs_of(contract: Contract, network: Network, given: Given) -> Contract:
-    """Guess the output from what the graph returns. Raises ContractError."""
+def outputs_of(contract: Contract, network: Network, given: Given) -> list[Contract]:
+    """Guess the output from what the graph returns: the likely ones first. Raises ContractError."""
     size = texture_size(contract)
     pair = scene(*size, 8, 24, seed=11)
     raw = Trial(contract, network).raw(pair.left, pair.right)
@@ -126,22 +127,32 @@ def outputs_of(contract: Contract, network: Network, given: Given) -> Contract:
         secondary = bool(_SECOND.search(name))
         return secondary, -scale, not _DISPARITY.search(name), name != "output"
 
-    name = given.output or min(maps_of_disparity, key=preference)
-    layout, scale = maps[name]
     sigma = given.sigma or ("confidence" if confidence else "constant")
     if sigma == "confidence" and not confidence:
         raise ContractError(f"the graph returns no confidence, but {shapes}")
-    return replace(
+    contract = replace(
         contract,
-        output=name,
-        output_layout=layout,
-        output_dtype=found[name].dtype.name,
-        output_scale=scale,
         sigma=sigma,
         sigma_px=given.sigma_px or 1.0,
         confidence=confidence,
         confidence_layout=maps[confidence][0] if confidence else "NCHW",
     )
+    names = [given.output] if given.output else sorted(maps_of_disparity, key=preference)
+    likely = []
+    for name in names:
+        layout, scale = maps[name]
+        described = replace(
+            contract,
+            output=name,
+            output_layout=layout,
+            output_dtype=found[name].dtype.name,
+            output_scale=scale,
+        )
+        channels = found[name].shape[layout.index("C")] if "C" in layout else 1
+        likely += [(channel, described) for channel in range(channels)]
+    # The first channel of every map comes before the second of any.
+    likely.sort(key=lambda each: each[0])
+    return [replace(each, output_channel=channel) for channel, each in likely[:_MOST_MAPS]]
 
 
 def iterations_in(file_name: str) -> int:
@@ -206,13 +217,17 @@ def _images(images: Sequence[_Input], given: Given) -> Contract:
     if len(images) not in (1, 2, 4) or any(count is None for count, _ in channels):
         raise ContractError(
             "expected one input with both images, two with an image each, or four with both at "
-            f"two sizes, got {words}"
+            f"two sizes, got {words}; wrap the network in a module that takes two images "
+            "[B, 3, H, W], and export that"
         )
     count, last = channels[0]
     kind = _TYPES[images[0].kind]
     if len(images) == 1:
         if count not in (2, 6):
-            raise ContractError(f"expected both images in the only input, got {words}")
+            raise ContractError(
+                f"expected both images in the channels of the only input, got {words}; wrap the "
+                "network in a module that takes two images [B, 3, H, W], and export that"
+            )
         order = given.order or ("grey" if count == 2 else "rgb")
         return Contract(
             images[0].name,
@@ -300,6 +315,10 @@ def _layout_of(value: NDArray[Any], size: tuple[int, int]) -> tuple[Layout, floa
         channels = value.shape[layout.index("C")] if "C" in layout else 1
         for scale in (1.0, 0.5, 0.25, 0.125, 0.0625):
             whole = (round(size[0] * scale), round(size[1] * scale))
-            if (height, width) == whole and channels <= 4 and np.issubdtype(value.dtype, np.number):
+            if (
+                (height, width) == whole
+                and channels <= _MOST_MAPS
+                and np.issubdtype(value.dtype, np.number)
+            ):
                 return layout, scale
     return None

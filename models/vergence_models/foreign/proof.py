@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from vergence_models.foreign.contract import Contract, ContractError
 from vergence_models.foreign.textures import Plane, Scene, scene, texture
@@ -35,6 +35,7 @@ class Seen:
     share: float  # pixels whose value, times ``factor``, is right
     dim_share: float  # the same in poor light, where a wrong range of the pixels shows
     factor: float | None  # what makes the output a disparity; None: nothing does
+    of_depth: bool = False  # the output is a depth, and the factor is divided by it
 
     @property
     def matched(self) -> bool:
@@ -81,7 +82,8 @@ def scenes_for(contract: Contract) -> list[Scene]:
 
 def observe(contract: Contract, network: Network) -> Seen:
     """Run the scenes. Raises ContractError if the graph fails on a pair."""
-    trial = Trial(replace(contract, factor=1.0, sigma="constant"), network)
+    plain = replace(contract, factor=1.0, of_depth=False, of_width=False, sigma="constant")
+    trial = Trial(plain, network)
     scenes = scenes_for(contract)
     values = [trial.disparity_px(each.left, each.right) for each in scenes]
     expected: list[float] = []
@@ -94,15 +96,21 @@ def observe(contract: Contract, network: Network) -> Seen:
         found += medians
         telling = float(np.median(value[each.telling]))
         right_views += abs(telling - medians[0]) < abs(telling - medians[1])
-    factor = _factor_of(expected, found)
+    factor, of_depth = _factor_of(expected, found), False
+    if factor is None and np.all(found):
+        factor, of_depth = _factor_of(expected, [1 / each for each in found]), True
     of_the_right = right_views > len(scenes) / 2
     if factor is None:
         return Seen(tuple(expected), tuple(found), of_the_right, 0.0, 0.0, None)
-    shares = [_share(value * factor, each) for value, each in zip(values, scenes, strict=True)]
+
+    def share_of(value: Plane, each: Scene) -> float:
+        with np.errstate(divide="ignore"):
+            return _share(factor / value if of_depth else factor * value, each)
+
+    share = float(np.mean([share_of(*each) for each in zip(values, scenes, strict=True)]))
     dim = scenes[-1].dimmed()
-    dim_share = _share(trial.disparity_px(dim.left, dim.right) * factor, dim)
-    share = float(np.mean(shares))
-    return Seen(tuple(expected), tuple(found), of_the_right, share, dim_share, factor)
+    dim_share = share_of(trial.disparity_px(dim.left, dim.right), dim)
+    return Seen(tuple(expected), tuple(found), of_the_right, share, dim_share, factor, of_depth)
 
 
 def _share(found_px: Plane, pair: Scene) -> float:
@@ -123,8 +131,16 @@ def _factor_of(expected_px: list[float], found: list[float]) -> float | None:
     if not np.isfinite(got).all() or not np.dot(got, got):
         return None
     factor = float(np.dot(wanted, got) / np.dot(got, got))
-    if np.any(np.abs(got * factor - wanted) > np.maximum(_TOLERANCE_PX, _TOLERANCE * wanted)):
-        return None
+    return _simple(factor) if _near(got * factor, wanted) else None
+
+
+def _near(found_px: ArrayLike, wanted_px: ArrayLike) -> bool:
+    found, wanted = np.asarray(found_px), np.asarray(wanted_px)
+    within = np.maximum(_TOLERANCE_PX, _TOLERANCE * wanted)
+    return bool(np.all(np.abs(found - wanted) <= within))
+
+
+def _simple(factor: float) -> float:
     # Whole factors and their reciprocals are what networks use.
     for simple in (abs(factor), 1 / abs(factor)):
         whole = round(simple)
@@ -161,9 +177,41 @@ def prove(contract: Contract, network: Network, *, search_pixels: bool = False) 
             chosen = contract.pixels
         factor = matched[chosen].factor
         assert factor is not None
-        found = replace(contract, pixels=chosen, swapped=swapped, factor=factor)
+        found = replace(
+            contract,
+            pixels=chosen,
+            swapped=swapped,
+            factor=factor,
+            of_depth=matched[chosen].of_depth,
+            of_width=False,
+        )
+        found = _at_another_width(found, network)
         return Proof(found, matched[chosen], tuple(each for each in as_good if each != chosen))
     return Proof(None, own, (), _blind_to(contract, network))
+
+
+def _at_another_width(contract: Contract, network: Network) -> Contract:
+    """Return the contract, with ``of_width`` if the factor grows with the width of the image.
+
+    Raises ContractError if the output there is no disparity.
+    """
+    if contract.size is not None:
+        return contract
+    height, width = texture_size(contract)
+    whole = max(contract.multiple_of, 1)
+    wider = -(-3 * width // 2 // whole) * whole
+    pair = scene(height, wider, 8, 32, seed=13)
+    found = Trial(replace(contract, sigma="constant"), network).disparity_px(pair.left, pair.right)
+    medians = [float(np.median(found[pair.truth_px == px])) for px in (8, 32)]
+    if _near(medians, [8, 32]):
+        return contract
+    growth = wider / width
+    if _near([growth * each for each in medians], [8, 32]):
+        return replace(contract, factor=_simple(contract.factor / width), of_width=True)
+    raise ContractError(
+        f"scale: right in images {width} px wide, but in those {wider} px wide the disparity is "
+        f"{medians[0]:.4g} for 8 px and {medians[1]:.4g} for 32 px"
+    )
 
 
 def _blind_to(contract: Contract, network: Network) -> str:
@@ -258,11 +306,18 @@ def differences(given: Contract, proof: Proof) -> list[str]:
         wrong.append(
             f"normalisation: the textures are found with pixels {found.pixels}, not {given.pixels}"
         )
+    if found.of_depth != given.of_depth:
+        return [
+            *wrong,
+            f"depth: the output is {proof.seen.words} of disparity, so it is "
+            f"{'a depth' if found.of_depth else 'a disparity'}",
+        ]
     if found.factor * given.factor < 0:
         wrong.append(f"sign: the output is {proof.seen.words} of disparity")
-    if abs(abs(found.factor / given.factor) - 1) > _TOLERANCE:
+    same_scale = found.of_width == given.of_width
+    if not same_scale or abs(abs(found.factor / given.factor) - 1) > _TOLERANCE:
         wrong.append(
             f"scale: the output is {proof.seen.words} of disparity, so the factor is "
-            f"{found.factor:g}, not {given.factor:g}"
+            f"{found.factor_words}, not {given.factor_words}"
         )
     return wrong
