@@ -41,6 +41,12 @@ _PING = pb.StreamDepthRequest(ping=pb.Ping()).SerializeToString()  # its time is
 _CLOSE_TIMEOUT_S = 2.0
 _LOOK_INTERVAL_S = 0.1
 
+# A stream that was resumed in time starts cold all the same if its next frame is too far away.
+_TOO_FAR = {
+    pb.ORIGIN_RESET_GAP: "too much time has passed",
+    pb.ORIGIN_RESET_POSE_JUMP: "the camera has moved too far",
+}
+
 _NOTICES = {
     pb.NOTICE_KIND_DRAINING: EventKind.DRAINING,
     pb.NOTICE_KIND_EXPIRING: EventKind.EXPIRING,
@@ -91,6 +97,7 @@ class StreamConnection:
         self._outbox: asyncio.Queue[Request] = asyncio.Queue()
         self._silence = Silence()
         self._ending = False
+        self._resumed = False  # and no map has come since
         self.state: SessionState = SessionState.RECONNECTING
 
     @property
@@ -281,6 +288,7 @@ class StreamConnection:
         away_s = time.monotonic() - started
         gone, self._attacher.gone = self._attacher.gone, None
         self._begin()
+        self._resumed = gone is None
         if gone is None:
             self._tell(EventKind.RESUMED, f"resumed after {away_s:.2f} s")
         else:
@@ -312,8 +320,20 @@ class StreamConnection:
             case "notice" if response.notice.kind in _NOTICES:
                 notice = response.notice
                 self._tell(_NOTICES[notice.kind], notice.message, notice.in_s)
-            case _:
+            case kind:
+                if kind == "disparity":
+                    self._tell_if_cold(response.disparity)
                 await self._listener.answered(response)
+
+    def _tell_if_cold(self, disparity: pb.DisparityMap) -> None:
+        """Correct the report that the stream was resumed, if its first map does not show that."""
+        resumed, self._resumed = self._resumed, False
+        if resumed and (why := _TOO_FAR.get(disparity.origin)):
+            self._tell(
+                EventKind.RESTARTED,
+                f"the stream's memory is lost: {why} between frame {disparity.frame_id} and the "
+                "last one before it, so that it was a cold start",
+            )
 
     def _tell(self, kind: EventKind, message: str, in_s: float = 0.0) -> None:
         self._report(SessionEvent(kind, message, in_s))

@@ -135,9 +135,11 @@ class EventKind(StrEnum):
     DISCONNECTED = "disconnected"
     """The connection broke; the session is trying to resume."""
     RESUMED = "resumed"
-    """Another connection is up, and the stream's state was kept."""
+    """Another connection is up, and the stream's state was kept. If the next frame is too far from
+    the last one for the server to use that state, ``RESTARTED`` follows with its result."""
     RESTARTED = "restarted"
-    """Another connection is up, and the stream's state is lost: the next frame is a cold start."""
+    """Another connection is up, and the stream's state is lost: the next frame is a cold start, or
+    the one whose result has just arrived was."""
     WAITING = "waiting"
     """The server has no room for the stream now; the session tries again."""
     DRAINING = "draining"

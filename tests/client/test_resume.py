@@ -3,11 +3,12 @@
 import asyncio
 
 import numpy as np
+import pytest
 
 from tests.support.frames import make_frame
 from tests.support.scene import scene
 from tests.support.session_frames import step
-from vergence import Delivery, DepthResult, EventKind, NotSent, Origin
+from vergence import Delivery, DepthResult, EventKind, NotSent, Origin, Pose
 
 
 async def undisturbed(count: int) -> list[DepthResult]:
@@ -29,6 +30,32 @@ async def test_a_cut_connection_resumes_with_the_state_as_it_was() -> None:
         assert result.step_count == same.step_count
     assert [result.origin for result in results[2:5]] == [Origin.WARM, Origin.RESUMED, Origin.WARM]
     assert rough.kinds == [EventKind.DISCONNECTED, EventKind.RESUMED]
+
+
+@pytest.mark.parametrize(
+    ("later_s", "metres", "origin", "words"),
+    [
+        (60.0, 0.0, Origin.RESET_GAP, "too much time has passed"),
+        (0.1, 50.0, Origin.RESET_POSE_JUMP, "moved too far"),
+    ],
+)
+async def test_a_resumed_stream_that_starts_cold_says_so(
+    later_s: float, metres: float, origin: Origin, words: str
+) -> None:
+    async with scene() as rough, rough.open_session(Delivery.EVERY) as session:
+        await step(session, 1)
+        rough.proxy.cut()
+        await rough.until(EventKind.DISCONNECTED)
+        rough.proxy.mend()
+        await rough.until(EventKind.RESUMED)
+        frame = make_frame(2)
+        pose = Pose(np.eye(3), np.array([metres, 0.0, 0.0]))
+        result = await session.step(
+            frame.left, frame.right, pose, capture_ns=frame.capture_ns + int(later_s * 1e9)
+        )
+        assert result.origin is origin
+        assert rough.kinds == [EventKind.DISCONNECTED, EventKind.RESUMED, EventKind.RESTARTED]
+        assert words in rough.events[-1].message
 
 
 async def test_a_step_that_never_arrived_is_sent_again() -> None:
