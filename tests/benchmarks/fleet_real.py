@@ -6,13 +6,18 @@
 ``--streams`` sessions of the SDK, half of them lossless and half live, send frames at ``--hz``
 through Envoy, which runs docker/envoy.yaml. Meanwhile, in turn, one server is killed (SIGKILL),
 suspended (SIGSTOP) and continued, drained (SIGTERM), removed from Envoy and then drained, and one
-is added. For each of these there is one row:
+is added. Then Redis is killed and started again, full, suspended for 3 s, and emptied. For each of
+these there is one row:
 
 - ``moved``: streams that had to attach again, and ``restarted``: those among them whose state was
   lost, so that they started cold.
 - ``live`` and ``lossless``: the longest time between two answers of each stream that moved, median
   and maximum, and the maximum of those that did not move, in milliseconds. A server steps lossless
   frames in the gaps of its live streams, so they wait up to 2 s beside them, moved or not.
+- ``saves_failed`` and ``log_lines`` (Redis): how many writes of snapshots the servers counted as
+  failed, and how many lines about it they logged.
+
+``redis``: calls of its scripts, their CPU time, and the time between two saves of one stream.
 
 ``checked``: at the end, every answer is compared with an undisturbed run on one server: a lossless
 stream with a run of all its frames, a live stream with a run of those frames that its state has
@@ -20,184 +25,45 @@ seen. ``different`` counts the answers that are not equal to the bit, ``unknown`
 streams for which it is not known which frames their state has seen, and ``unanswered`` the frames
 of lossless streams whose step raised an error.
 
-``envoy``: median time of one lossless step, direct and through Envoy in turn, on the idle fleet.
+``start_s``: from the start of a server's process until it serves.
+
+``envoy``: median time of one lossless step, direct and through Envoy in turn, on the idle fleet,
+and Envoy's CPU time for it.
 """
 
 import argparse
 import asyncio
-import hashlib
 import json
 import logging
 import os
+import re
 import signal
 import statistics
 import sys
 import time
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, field
-from functools import cache
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
+import httpx
 
 from vergence import (
     Delivery,
     DepthClient,
-    DepthResult,
-    DepthSession,
     EventKind,
-    OutputFormat,
-    PlaneEncoding,
-    Pose,
-    RectifiedRig,
-    SessionEvent,
 )
-from vergence_proto.errors import DepthError
 from vergence_proto.instruction_set import instruction_set
 
 sys.path.insert(0, str(Path(__file__).parents[2]))  # for tests.support
 
 from tests.support.fleet import Fleet, ServerProcess, fleet
+from tests.support.fleet_load import EXACT, Answer, Load, StreamLog, digest_of, rig_of, step
 
-EXACT = OutputFormat(encoding=PlaneEncoding.FLOAT32)
-IMAGES = 16  # different ones, then they repeat
 LEAD_S = 4.0  # before the first disturbance
 SETTLE_S = 6.0  # from one disturbance to the next
 SUSPENDED_S = 5.0
-
-
-@dataclass(frozen=True, slots=True)
-class Answer:
-    frame_id: int
-    step_count: int
-    digest: bytes
-    time_s: float
-
-
-@dataclass(slots=True, eq=False)
-class StreamLog:
-    """What one session has seen."""
-
-    number: int
-    lossless: bool
-    answers: list[Answer] = field(default_factory=list)
-    sent: set[int] = field(default_factory=set)
-    events: list[tuple[float, EventKind]] = field(default_factory=list)
-    errors: list[str] = field(default_factory=list)
-
-    @property
-    def delivery(self) -> Delivery:
-        return Delivery.EVERY if self.lossless else Delivery.NEWEST
-
-    def note(self, result: DepthResult) -> None:
-        self.answers.append(
-            Answer(result.frame_id, result.step_count, digest_of(result), time.monotonic())
-        )
-
-    def event(self, event: SessionEvent) -> None:
-        self.events.append((time.monotonic(), event.kind))
-
-    def had(self, kind: EventKind, from_s: float, to_s: float) -> bool:
-        return any(kind is each and from_s <= at_s < to_s for at_s, each in self.events)
-
-    def gap_s(self, from_s: float, to_s: float) -> float:
-        times = [each.time_s for each in self.answers if from_s - 1.0 <= each.time_s < to_s]
-        return max(
-            (later - earlier for earlier, later in pairwise(times)),
-            default=to_s - from_s,
-        )
-
-
-def digest_of(result: DepthResult) -> bytes:
-    return hashlib.sha256(result.disparity_px.tobytes()).digest()
-
-
-def rig_of(width: int, height: int) -> RectifiedRig:
-    middle = ((width - 1) / 2, (height - 1) / 2)
-    return RectifiedRig(
-        width, height, 0.8 * width, 0.8 * width, middle[0], middle[0], middle[1], 0.1
-    )
-
-
-@cache
-def image(number: int, index: int, width: int, height: int) -> NDArray[np.uint8]:
-    seed = number * IMAGES + index
-    return np.random.default_rng(seed).integers(0, 256, (height, width + 12), np.uint8)
-
-
-async def step(session: DepthSession, number: int, frame_id: int, size: tuple[int, int]) -> Any:
-    return await session.step(*pair(number, frame_id, size), capture_ns=frame_id * 100_000_000)
-
-
-def pair(number: int, frame_id: int, size: tuple[int, int]) -> tuple[Any, Any, Pose]:
-    wide = image(number, frame_id % IMAGES, *size)
-    pose = Pose(np.eye(3), np.array([0.01 * frame_id, 0.0, 0.0]))
-    return wide[:, 12:], wide[:, :-12], pose
-
-
-class Load:
-    """The streams, at one rate, until they are asked to end."""
-
-    def __init__(self, address: str, *, streams: int, hz: float, size: tuple[int, int]) -> None:
-        self.logs = [StreamLog(number, number % 2 == 0) for number in range(streams)]
-        self._address = address
-        self._hz = hz
-        self._size = size
-        self._end = asyncio.Event()
-
-    async def run(self) -> None:
-        async with DepthClient(self._address) as client, asyncio.TaskGroup() as tasks:
-            for log in self.logs:
-                tasks.create_task(self._stream(client, log))
-
-    def end(self) -> None:
-        self._end.set()
-
-    async def _stream(self, client: DepthClient, log: StreamLog) -> None:
-        await asyncio.sleep(log.number / self._hz / len(self.logs))
-        async with client.open_session(
-            rig_of(*self._size),
-            delivery=log.delivery,
-            output=EXACT,
-            on_event=log.event,
-            stream_id=f"camera-{log.number}",
-        ) as session:
-            await (self._lossless if log.lossless else self._live)(session, log)
-
-    async def _lossless(self, session: DepthSession, log: StreamLog) -> None:
-        frame_id, next_s = 0, time.monotonic()
-        while not self._end.is_set():
-            frame_id += 1
-            log.sent.add(frame_id)
-            try:
-                log.note(await step(session, log.number, frame_id, self._size))
-            except DepthError as error:
-                log.errors.append(f"frame {frame_id}: {error.code} {error}")
-            next_s = max(next_s + 1 / self._hz, time.monotonic() - 1.0)
-            await asyncio.sleep(next_s - time.monotonic())
-
-    async def _live(self, session: DepthSession, log: StreamLog) -> None:
-        async def read() -> None:
-            async for result in session:
-                log.note(result)
-
-        reading = asyncio.create_task(read())
-        next_id, next_s = 1, time.monotonic()
-        while not self._end.is_set():
-            # The content follows from the id, and the next id is known only after a frame is sent.
-            sent = session.submit(
-                *pair(log.number, next_id, self._size), capture_ns=next_id * 100_000_000
-            )
-            if sent:
-                log.sent.add(next_id)
-                next_id += 1
-            next_s += 1 / self._hz
-            await asyncio.sleep(max(next_s - time.monotonic(), 0.0))
-        session.end()
-        await reading
+REDIS_TROUBLE_S = 3.0
+ENVOY_FRAMES = 150
 
 
 async def measure(load: Load, name: str, disturb: Callable[[], Awaitable[None]]) -> dict[str, Any]:
@@ -269,6 +135,79 @@ async def disturbances(several: Fleet, load: Load) -> list[dict[str, Any]]:
     return rows
 
 
+async def troubles_of_redis(several: Fleet, load: Load) -> list[dict[str, Any]]:
+    store = several.store
+    alive = [each for each in several.servers if each.process.poll() is None]
+
+    async def down() -> None:
+        store.kill()
+        await asyncio.sleep(REDIS_TROUBLE_S)
+        await asyncio.to_thread(store.start)
+
+    async def full() -> None:
+        store.admin.config_set("maxmemory", 1)
+        await asyncio.sleep(REDIS_TROUBLE_S)
+        store.admin.config_set("maxmemory", 0)
+
+    async def hangs() -> None:
+        store.send(signal.SIGSTOP)
+        await asyncio.sleep(REDIS_TROUBLE_S)
+        store.send(signal.SIGCONT)
+
+    async def wiped() -> None:
+        store.admin.flushall()
+
+    rows = []
+    for trouble in (down, full, hangs, wiped):
+        failed, lines = await snapshots_failed(alive), lines_about_snapshots(alive)
+        row = await measure(load, f"Redis {trouble.__name__}", trouble)
+        row["saves_failed"] = await snapshots_failed(alive) - failed
+        row["log_lines"] = lines_about_snapshots(alive) - lines
+        print(row["saves_failed"], row["log_lines"], flush=True)  # noqa: T201  a program
+        rows.append(row)
+    return rows
+
+
+async def snapshots_failed(servers: list[ServerProcess]) -> int:
+    count = 0.0
+    async with httpx.AsyncClient() as http:
+        for server in servers:
+            metrics = (await http.get(f"http://{server.http_address}/metrics")).text
+            found = re.search(r'^vergence_snapshots_total\{outcome="failed"\} (\S+)', metrics, re.M)
+            count += float(found[1]) if found else 0.0
+    return int(count)
+
+
+def lines_about_snapshots(servers: list[ServerProcess]) -> int:
+    """Count the warnings that snapshots are not stored, and not the lines that they are again."""
+    return sum(each.log.count("cannot be stored") for each in servers)
+
+
+def redis_figures(several: Fleet, load: Load, *, before: dict[str, Any]) -> dict[str, Any]:
+    """What the saves cost Redis until now, since ``before``; nothing has restarted it."""
+    now = scripts_of(several)
+    calls, cpu_us = now["calls"] - before["calls"], now["usec"] - before["usec"]
+    answers = sum(len(log.answers) for log in load.logs)
+    return {
+        "scripts": calls,
+        "answers": answers,
+        "cpu_ms_per_script": round(cpu_us / calls / 1000, 2),
+        "ms_between_saves_of_a_stream": round(
+            1000 * len(load.logs) * (time.monotonic() - before["time_s"]) / calls
+        ),
+        "bytes": several.store.admin.info("memory")["used_memory_peak"],
+    }
+
+
+def scripts_of(several: Fleet) -> dict[str, Any]:
+    stats = several.store.admin.info("commandstats").get("cmdstat_evalsha", {})
+    return {
+        "calls": stats.get("calls", 0),
+        "usec": stats.get("usec", 0),
+        "time_s": time.monotonic(),
+    }
+
+
 def chain_of(log: StreamLog) -> tuple[list[Answer | int], int]:
     """Return the frames that the last state has seen, in order; and the answers not among them.
 
@@ -316,7 +255,8 @@ async def compare(address: str, load: Load, size: tuple[int, int]) -> dict[str, 
     return counts
 
 
-async def cost_of_envoy(direct: str, front: str, size: tuple[int, int]) -> dict[str, Any]:
+async def cost_of_envoy(several: Fleet, size: tuple[int, int]) -> dict[str, Any]:
+    direct, front = several.servers[0].address, several.envoy.address
     times_s: dict[str, list[float]] = {direct: [], front: []}
     async with DepthClient(direct) as one, DepthClient(front) as other:
         options: dict[str, Any] = {"delivery": Delivery.EVERY, "output": EXACT}
@@ -324,11 +264,13 @@ async def cost_of_envoy(direct: str, front: str, size: tuple[int, int]) -> dict[
             one.open_session(rig_of(*size), **options) as near,
             other.open_session(rig_of(*size), **options) as far,
         ):
-            for frame_id in range(1, 151):
+            began_cpu_s = several.envoy.cpu_s()
+            for frame_id in range(1, ENVOY_FRAMES + 1):
                 for address, session in ((direct, near), (front, far)):
                     began_s = time.perf_counter()
                     await step(session, 0, frame_id, size)
                     times_s[address].append(time.perf_counter() - began_s)
+            cpu_s = several.envoy.cpu_s() - began_cpu_s
     direct_ms, envoy_ms = (
         round(1000 * statistics.median(times_s[each][20:]), 2) for each in (direct, front)
     )
@@ -337,6 +279,7 @@ async def cost_of_envoy(direct: str, front: str, size: tuple[int, int]) -> dict[
         "direct_ms": direct_ms,
         "envoy_ms": envoy_ms,
         "more_ms": round(envoy_ms - direct_ms, 2),
+        "cpu_ms": round(1000 * cpu_s / ENVOY_FRAMES, 2),
         "bytes_up": bytes_up,
         "bytes_down": 2 * bytes_up,
     }
@@ -347,15 +290,21 @@ async def run(options: argparse.Namespace) -> dict[str, Any]:
     environment = {"VERGENCE_MODEL__NAME": options.model, "VERGENCE_MODEL__THREADS": "1"}
     async with fleet(environment) as several:
         for name in ("a", "b", "c"):
+            began_s = time.monotonic()
             await several.add_server(name)
+            start_s = time.monotonic() - began_s
         several.lead_to(several.servers)
         await several.envoy.start()
-        envoy = await cost_of_envoy(several.servers[0].address, several.envoy.address, size)
+        envoy = await cost_of_envoy(several, size)
         print(envoy, flush=True)  # noqa: T201  a program
         load = Load(several.envoy.address, streams=options.streams, hz=options.hz, size=size)
         running = asyncio.create_task(load.run())
         await asyncio.sleep(LEAD_S)
+        before = scripts_of(several)
         rows = await disturbances(several, load)
+        redis = redis_figures(several, load, before=before)
+        print(redis, flush=True)  # noqa: T201  a program
+        rows += await troubles_of_redis(several, load)
         load.end()
         await running
         counts = await compare(several.servers[-1].address, load, size)
@@ -369,10 +318,11 @@ async def run(options: argparse.Namespace) -> dict[str, Any]:
                 "model": options.model,
                 "load_average": os.getloadavg()[0],
             },
+            "start_s": round(start_s, 2),
             "disturbances": rows,
             "answers": counts,
             "errors": [error for log in load.logs for error in log.errors],
-            "redis_bytes": several.store.admin.info("memory")["used_memory_peak"],
+            "redis": redis,
             "envoy": envoy,
         }
 

@@ -56,6 +56,10 @@ class ServerProcess:
                 assert self.process.poll() is None, f"server {self.name} did not start"
                 await asyncio.sleep(0.1)
 
+    @property
+    def log(self) -> str:
+        return (self._folder / f"{self.name}.log").read_text()
+
     def send(self, number: signal.Signals) -> None:
         self.process.send_signal(number)
 
@@ -138,6 +142,12 @@ class Envoy:
                 "eds_config": {"resource_api_version": "V3", "path_config_source": source}
             }
         return config
+
+    def cpu_s(self) -> float:
+        """Return the CPU time until now."""
+        assert self._process is not None
+        fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")  # user, system
 
     def stop(self) -> None:
         if self._process is not None:

@@ -1,6 +1,7 @@
 """A real Redis server on a free port, for the length of a block."""
 
 import shutil
+import signal
 import socket
 import subprocess
 import time
@@ -43,6 +44,9 @@ class RedisServer:
                 return
             time.sleep(0.01)
         raise TimeoutError("redis-server does not answer")
+
+    def send(self, number: signal.Signals) -> None:
+        self._process.send_signal(number)
 
     def kill(self) -> None:
         self._process.kill()
