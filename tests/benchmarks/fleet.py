@@ -261,7 +261,7 @@ def headsets(
     }
 
 
-def _snapshot_row(file: Path) -> dict[str, float]:
+def snapshot_row(file: Path) -> dict[str, float]:
     [row] = [each for each in json.loads(file.read_text())["rows"] if each["size"] == "640x480"]
     del row["size"]
     return dict(row)
@@ -270,6 +270,15 @@ def _snapshot_row(file: Path) -> dict[str, float]:
 async def measure_bytes() -> dict[str, float]:
     async with serving(packaged_weights_dir(), LANES) as server:
         return await bytes_of(server)
+
+
+def gap_s(real: dict[str, Any]) -> float:
+    """Return the longest gap of the streams whose server was killed. Live ones show it best."""
+    [kill] = [each for each in real["disturbances"] if each["disturbance"] == "kill -9"]
+    gap_ms = kill["live"]["gap_max_ms"] or kill["lossless"]["gap_max_ms"]
+    if gap_ms is None:
+        raise SystemExit("the server that fleet_real.py killed had no stream; run it again")
+    return float(1e-3 * gap_ms)
 
 
 def simulate(args: argparse.Namespace) -> dict[str, Any]:
@@ -281,17 +290,16 @@ def simulate(args: argparse.Namespace) -> dict[str, Any]:
         }
         for count, row in rows.items()
     }
-    for count, row in checked.items():
-        show(f"checked {count}", row)
     real = json.loads(args.real.read_text())
-    [kill] = [each for each in real["disturbances"] if each["disturbance"] == "kill -9"]
     costs = replace(
         here,
         beside_s=samples(np.array(here.beside_s), mean_s=cpu_s),
-        gap_s=1e-3 * (kill["live"]["gap_max_ms"] or kill["lossless"]["gap_max_ms"]),
+        gap_s=gap_s(real),
         start_s=real["start_s"],
     )
-    figures: dict[str, Any] = {
+    per_server = {f"{hz:g} Hz": capacity(costs, hz) for hz in RATES_HZ}
+    wire, snapshots = asyncio.run(measure_bytes()), snapshot_row(args.snapshots)
+    return {
         "costs": {
             "alone_ms": 1e3 * float(np.mean(costs.alone_s)),
             "beside_ms": 1e3 * float(np.mean(costs.beside_s)),
@@ -300,47 +308,41 @@ def simulate(args: argparse.Namespace) -> dict[str, Any]:
             "start_s": costs.start_s,
         },
         "checked": checked,
-        "bytes": asyncio.run(measure_bytes()),
+        "bytes": wire,
+        "capacity": per_server,
+        **large(costs, per_server["10 Hz"], args.servers),
+        "headsets": {
+            f"{hz:g} Hz": headsets(
+                hz, per_server[f"{hz:g} Hz"], wire, snapshots, real["envoy"]["small"]
+            )
+            for hz in RATES_HZ
+        },
     }
-    show("costs", figures["costs"])
-    show("bytes", figures["bytes"])
-    figures["capacity"] = {f"{hz:g} Hz": capacity(costs, hz) for hz in RATES_HZ}
-    show("capacity", figures["capacity"])
-    per_server = figures["capacity"]["10 Hz"]
+
+
+def large(costs: Costs, per_server: int, servers: int) -> dict[str, Any]:
+    """Simulate many servers, with and without a bound on the fullest one."""
     loaded = int(LOAD * per_server)
-    figures["spread"] = {
-        f"{servers} servers": {
-            **{
-                f"{points} points": fullest(costs, servers, loaded, points=points, balance=np.inf)
-                for points in (1024, 65536)
-            },
-            "bound 1.25": fullest(costs, servers, loaded, points=65536, balance=1.25),
+    figures: dict[str, Any] = {"spread": {}}
+    for count, each in ((3, loaded), (10, loaded), (50, loaded), (50, 8 * loaded)):
+        draw = partial(fullest, costs, count, each)
+        figures["spread"][f"{count} servers of {each}"] = {
+            "1024 points": draw(points=1024, balance=np.inf),
+            "65536 points": draw(points=65536, balance=np.inf),
+            "bound 1.25": draw(points=65536, balance=1.25),
         }
-        for servers in (3, 10, 50, 250)
-    }
-    for name, row in figures["spread"].items():
-        show(f"spread {name}", row)
     for name, balance in (("free", np.inf), ("bound 1.25", 1.25)):
-        streams = loaded * args.servers
-        figures[f"kill, {name}"] = killed(costs, args.servers, streams, 10.0, balance)
-        show(f"kill, {name}", figures[f"kill, {name}"])
+        figures[f"kill, {name}"] = killed(costs, servers, loaded * servers, 10.0, balance)
         figures[f"growth, {name}"] = growth(costs, per_server, 10.0, balance)
-        show(f"growth, {name}", figures[f"growth, {name}"])
-    snapshots = _snapshot_row(args.snapshots)
-    figures["headsets"] = {
-        f"{hz:g} Hz": headsets(
-            hz, figures["capacity"][f"{hz:g} Hz"], figures["bytes"], snapshots, real["envoy"]
-        )
-        for hz in RATES_HZ
-    }
-    for name, row in figures["headsets"].items():
-        show(f"headsets {name}", row)
     return figures
 
 
-def show(name: str, values: dict[str, float]) -> None:
-    text = " ".join(f"{key} {value:.2f}" for key, value in values.items())
-    print(f"{name:22} {text}", flush=True)  # noqa: T201  a program
+def show(figures: dict[str, Any]) -> None:
+    for name, value in figures.items():
+        rows = value if isinstance(next(iter(value.values())), dict) else {"": value}
+        for row, values in rows.items():
+            text = " ".join(f"{key} {number:g}" for key, number in values.items())
+            print(f"{f'{name} {row}':30} {text}")  # noqa: T201  a program
 
 
 def rounded(values: Any) -> Any:
@@ -360,6 +362,7 @@ def main() -> None:
     args = parser.parse_args()
     began_s = time.monotonic()
     figures = rounded(simulate(args))
+    show(figures)
     machine = {"instruction_set": instruction_set(), "cores": os.cpu_count()}
     about = {"machine": machine, "seconds": round(time.monotonic() - began_s)}
     args.json.write_text(json.dumps({**about, **figures}, indent=1) + "\n")

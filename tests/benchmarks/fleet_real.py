@@ -28,7 +28,8 @@ of lossless streams whose step raised an error.
 ``start_s``: from the start of a server's process until it serves.
 
 ``envoy``: median time of one lossless step, direct and through Envoy in turn, on the idle fleet,
-and Envoy's CPU time for it.
+and Envoy's CPU time for it. ``exact``: raw images and float32 maps, as the streams of the rows;
+``small``: JPEG and every second pixel of the map, as a live session with a server elsewhere.
 """
 
 import argparse
@@ -51,6 +52,8 @@ from vergence import (
     Delivery,
     DepthClient,
     EventKind,
+    ImageEncoding,
+    OutputFormat,
 )
 from vergence_proto.instruction_set import instruction_set
 
@@ -64,6 +67,7 @@ SETTLE_S = 6.0  # from one disturbance to the next
 SUSPENDED_S = 5.0
 REDIS_TROUBLE_S = 3.0
 ENVOY_FRAMES = 150
+SMALL = OutputFormat(compressed=True, map_step=2, denominator=16)
 
 
 async def measure(load: Load, name: str, disturb: Callable[[], Awaitable[None]]) -> dict[str, Any]:
@@ -255,14 +259,13 @@ async def compare(address: str, load: Load, size: tuple[int, int]) -> dict[str, 
     return counts
 
 
-async def cost_of_envoy(several: Fleet, size: tuple[int, int]) -> dict[str, Any]:
+async def cost_of_envoy(several: Fleet, size: tuple[int, int], **formats: Any) -> dict[str, Any]:
     direct, front = several.servers[0].address, several.envoy.address
     times_s: dict[str, list[float]] = {direct: [], front: []}
     async with DepthClient(direct) as one, DepthClient(front) as other:
-        options: dict[str, Any] = {"delivery": Delivery.EVERY, "output": EXACT}
         async with (
-            one.open_session(rig_of(*size), **options) as near,
-            other.open_session(rig_of(*size), **options) as far,
+            one.open_session(rig_of(*size), delivery=Delivery.EVERY, **formats) as near,
+            other.open_session(rig_of(*size), delivery=Delivery.EVERY, **formats) as far,
         ):
             began_cpu_s = several.envoy.cpu_s()
             for frame_id in range(1, ENVOY_FRAMES + 1):
@@ -274,14 +277,11 @@ async def cost_of_envoy(several: Fleet, size: tuple[int, int]) -> dict[str, Any]
     direct_ms, envoy_ms = (
         round(1000 * statistics.median(times_s[each][20:]), 2) for each in (direct, front)
     )
-    bytes_up = 2 * size[0] * size[1]
     return {
         "direct_ms": direct_ms,
         "envoy_ms": envoy_ms,
         "more_ms": round(envoy_ms - direct_ms, 2),
         "cpu_ms": round(1000 * cpu_s / ENVOY_FRAMES, 2),
-        "bytes_up": bytes_up,
-        "bytes_down": 2 * bytes_up,
     }
 
 
@@ -295,7 +295,10 @@ async def run(options: argparse.Namespace) -> dict[str, Any]:
             start_s = time.monotonic() - began_s
         several.lead_to(several.servers)
         await several.envoy.start()
-        envoy = await cost_of_envoy(several, size)
+        envoy = {
+            "exact": await cost_of_envoy(several, size, output=EXACT),
+            "small": await cost_of_envoy(several, size, output=SMALL, encoding=ImageEncoding.JPEG),
+        }
         print(envoy, flush=True)  # noqa: T201  a program
         load = Load(several.envoy.address, streams=options.streams, hz=options.hz, size=size)
         running = asyncio.create_task(load.run())

@@ -3,7 +3,7 @@
 import asyncio
 import ssl
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.support.certificates import Authority
-from tests.support.fleet import Envoy
+from tests.support.fleet import Envoy, free_port
 from tests.support.frames import RIG
 from tests.support.models import RecallModel
 from tests.support.polling import eventually
@@ -56,11 +56,16 @@ async def front(folder: Path) -> AsyncIterator[Front]:
     envoy = Envoy(folder, certificate=authority.issue("front"))
     tokens = TokenFile(folder / "tokens.toml", "ana", "ben")
     flags: dict[str, Any] = {"security__tokens": str(tokens.path), "server__drain_s": 0.5}
+    flags["limits__streams"] = 16
+    ports = free_port(), free_port()
+    own: list[dict[str, Any]] = [
+        {"http__port": port, "batch__address": f"http://127.0.0.1:{port}"} for port in ports
+    ]
     with redis_server() as store:
-        flags["snapshots__store"] = store.url
+        flags["snapshots__store"] = flags["batch__servers"] = store.url
         async with (
-            running_server(RecallModel(), **flags) as a,
-            running_server(RecallModel(), **flags) as b,
+            running_server(RecallModel(), **flags, **own[0]) as a,
+            running_server(RecallModel(), **flags, **own[1]) as b,
         ):
             envoy.lead_to([(each.grpc_address, each.http_address) for each in (a, b)])
             try:
@@ -123,6 +128,23 @@ async def test_a_stream_keeps_its_server_when_it_connects_again(tmp_path: Path) 
                     assert two.server_of(stream_id) is server
 
 
+async def test_no_server_gets_many_more_streams_than_another(tmp_path: Path) -> None:
+    async with front(tmp_path) as two, two.client(two.tokens.tokens["ana"]) as ana:
+        at_one: list[str] = []  # ids that lead to the first server while there is room
+        for number in range(100):
+            async with ana.open_session(RIG, stream_id=f"camera-{number}") as session:
+                if two.server_of(session.stream_id) is two.servers[0]:
+                    at_one.append(session.stream_id)
+            if len(at_one) == 12:
+                break
+        async with AsyncExitStack() as sessions:
+            for stream_id in at_one:
+                await sessions.enter_async_context(ana.open_session(RIG, stream_id=stream_id))
+            counts = [len(list(each.engine.streams)) for each in two.servers]
+        assert sum(counts) == 12
+        assert counts[0] <= 9  # 1.25 times the mean, and one: Envoy looks before it adds
+
+
 async def test_streams_and_jobs_over_http_find_their_server(tmp_path: Path) -> None:
     room = write_sequence(tmp_path / "room", make_frames(3))
     async with front(tmp_path) as two:
@@ -138,3 +160,6 @@ async def test_streams_and_jobs_over_http_find_their_server(tmp_path: Path) -> N
                 job = await client.submit(room)
                 frames = [each async for each in job.frames()]
                 assert len(frames) == 3
+            # One that has no cookie of Envoy, as a program that is started again.
+            async with AsyncBatchClient(address, token=token, ca=two.ca) as another:
+                assert (await (await another.job(job.id)).wait()).frames_done == 3

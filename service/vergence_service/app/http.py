@@ -13,8 +13,10 @@ from typing import Any
 
 from fastapi import APIRouter
 from prometheus_client import CollectorRegistry
+from starlette.types import ASGIApp
 
 from vergence_service.access.gate import Gate
+from vergence_service.app.other_servers import with_other_servers
 from vergence_service.app.security import host_names, is_loopback
 from vergence_service.jobs.archive_limits import ArchiveLimits
 from vergence_service.jobs.places import Places
@@ -136,9 +138,13 @@ async def serving_http(
             ready=lambda: engine.ready,
             routes=routes,
         )
+        shared: ASGIApp = app
+        port = listening.getsockname()[1]
+        if queue and (passing := with_other_servers(app, queue, settings, port=port)):
+            shared = await stack.enter_async_context(passing)
         server = await stack.enter_async_context(
             HttpServer(
-                Border(app, gate=gate, hosts=host_names(settings)),
+                Border(shared, gate=gate, hosts=host_names(settings)),
                 calls,
                 listening=listening,
                 limits=ConnectionLimits(

@@ -71,6 +71,14 @@ class KeptUploads:
             f"no upload {upload_id[:64]!r}: it never existed, was deleted or submitted, or expired"
         )
 
+    def ids(self) -> list[str]:
+        """Return the ids of all uploads."""
+        return [each.upload_id for each in self._all()]
+
+    def has(self, upload_id: str) -> bool:
+        """Check for an upload of anybody."""
+        return upload_id.isalnum() and (self._directory / upload_id).is_dir()
+
     def held_bytes(self, besides: str = "", owner: str | None = None) -> int:
         """Return the space that uploads take, without the one of the id ``besides``.
 

@@ -133,6 +133,14 @@ class JobQueue:
         await self._worker.stop()
         await self._webhooks.stop()
 
+    async def names(self) -> list[str]:
+        """Return the names by which other servers look for what is here; see :meth:`has`."""
+        return [*self.jobs.names(), *await self.threads.run(self.uploads.ids)]
+
+    async def has(self, name: str) -> bool:
+        """Check for a job or an upload with this id, or a job that was submitted with this key."""
+        return self.jobs.has(name) or await self.threads.run(self.uploads.has, name)
+
     async def check_webhook(self, webhook: str) -> None:
         """Raise BadShape unless messages may go to this address; empty: there are none."""
         if webhook:

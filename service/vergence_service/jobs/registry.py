@@ -124,6 +124,15 @@ class JobRegistry:
         """
         return self.status(job_id), self.folder(job_id) / "result"
 
+    def names(self) -> list[str]:
+        """Return the ids of all jobs, and the keys of their submissions."""
+        jobs = self._jobs.values()
+        return [*self._jobs, *(job.key for job in jobs if job.key)]
+
+    def has(self, name: str) -> bool:
+        """Check for a job with this id, or submitted with this key."""
+        return name in self._jobs or self.keyed(name) is not None
+
     def keyed(self, key: str) -> Job | None:
         """Return the job that was submitted with this key, if any."""
         job_id = self._index.keyed(key)

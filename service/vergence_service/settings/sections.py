@@ -293,6 +293,18 @@ class BatchSettings(Section):
     max_ratio: PositiveFloat = Field(
         default=100.0, description="largest ratio of unpacked size to uploaded size"
     )
+    servers: str = Field(
+        default="none",
+        pattern=r"^(none|rediss?://\S+|unix://\S+)$",
+        description="where servers behind one front note which of them has a job, so that each "
+        "answers for all: none, or redis://HOST:PORT/DATABASE (needs the extra fleet)",
+    )
+    address: str | None = Field(
+        default=None,
+        pattern=r"^https?://[^/\s]+$",
+        description="URL of this server's HTTP port for the others of batch.servers; default: "
+        "the address of its host name",
+    )
     idle_s: PositiveFloat = Field(
         default=30.0, description="abort an upload that sends nothing for this long"
     )

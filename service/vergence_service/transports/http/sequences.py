@@ -209,7 +209,7 @@ def sequence_routes(
         responses=_ACCEPTED,
     )
     async def rerun(
-        request: Request, job_id: str, query: Annotated[OptionsQuery, Query()]
+        request: Request, response: Response, job_id: str, query: Annotated[OptionsQuery, Query()]
     ) -> SequenceJob:
         """Submit the input of a job again, with other options. It must have kept its input."""
         await queue.check_webhook(query.webhook)
@@ -231,12 +231,18 @@ def sequence_routes(
         with keys.taken(submission.key):
             if (earlier := jobs.keyed(submission.key)) is not None:
                 submission.check(earlier, None)
-                return SequenceJob.of(jobs.status(earlier.job_id))
-            async with queue.upload_folder(client, upload_bytes=0, owner=caller) as folder:
-                await queue.link_input(job_id, folder)
-                status = await queue.accept(
-                    folder, order, upload_sha256=before.upload_sha256, client=client, owner=caller
-                )
+                status = jobs.status(earlier.job_id)
+            else:
+                async with queue.upload_folder(client, upload_bytes=0, owner=caller) as folder:
+                    await queue.link_input(job_id, folder)
+                    status = await queue.accept(
+                        folder,
+                        order,
+                        upload_sha256=before.upload_sha256,
+                        client=client,
+                        owner=caller,
+                    )
+        response.headers["Location"] = f"/v1/sequences/{status.job.job_id}"
         return SequenceJob.of(status)
 
     @router.get("/v1/sequences/{job_id}", operation_id="get_sequence")
