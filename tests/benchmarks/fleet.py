@@ -298,7 +298,10 @@ def simulate(args: argparse.Namespace) -> dict[str, Any]:
         start_s=real["start_s"],
     )
     per_server = {f"{hz:g} Hz": capacity(costs, hz) for hz in RATES_HZ}
+    if not all(per_server.values()):
+        raise SystemExit(f"a server carries {per_server} streams: is this machine busy?")
     wire, snapshots = asyncio.run(measure_bytes()), snapshot_row(args.snapshots)
+    envoy = real["envoy"]["small"]
     return {
         "costs": {
             "alone_ms": 1e3 * float(np.mean(costs.alone_s)),
@@ -312,9 +315,7 @@ def simulate(args: argparse.Namespace) -> dict[str, Any]:
         "capacity": per_server,
         **large(costs, per_server["10 Hz"], args.servers),
         "headsets": {
-            f"{hz:g} Hz": headsets(
-                hz, per_server[f"{hz:g} Hz"], wire, snapshots, real["envoy"]["small"]
-            )
+            f"{hz:g} Hz": headsets(hz, per_server[f"{hz:g} Hz"], wire, snapshots, envoy)
             for hz in RATES_HZ
         },
     }

@@ -262,18 +262,19 @@ async def compare(address: str, load: Load, size: tuple[int, int]) -> dict[str, 
 async def cost_of_envoy(several: Fleet, size: tuple[int, int], **formats: Any) -> dict[str, Any]:
     direct, front = several.servers[0].address, several.envoy.address
     times_s: dict[str, list[float]] = {direct: [], front: []}
-    async with DepthClient(direct) as one, DepthClient(front) as other:
-        async with (
-            one.open_session(rig_of(*size), delivery=Delivery.EVERY, **formats) as near,
-            other.open_session(rig_of(*size), delivery=Delivery.EVERY, **formats) as far,
-        ):
-            began_cpu_s = several.envoy.cpu_s()
-            for frame_id in range(1, ENVOY_FRAMES + 1):
-                for address, session in ((direct, near), (front, far)):
-                    began_s = time.perf_counter()
-                    await step(session, 0, frame_id, size)
-                    times_s[address].append(time.perf_counter() - began_s)
-            cpu_s = several.envoy.cpu_s() - began_cpu_s
+    async with (
+        DepthClient(direct) as one,
+        DepthClient(front) as other,
+        one.open_session(rig_of(*size), delivery=Delivery.EVERY, **formats) as near,
+        other.open_session(rig_of(*size), delivery=Delivery.EVERY, **formats) as far,
+    ):
+        began_cpu_s = several.envoy.cpu_s()
+        for frame_id in range(1, ENVOY_FRAMES + 1):
+            for address, session in ((direct, near), (front, far)):
+                began_s = time.perf_counter()
+                await step(session, 0, frame_id, size)
+                times_s[address].append(time.perf_counter() - began_s)
+        cpu_s = several.envoy.cpu_s() - began_cpu_s
     direct_ms, envoy_ms = (
         round(1000 * statistics.median(times_s[each][20:]), 2) for each in (direct, front)
     )
