@@ -11,6 +11,7 @@ import tritonclient.grpc.aio as triton_grpc
 import tritonclient.http.aio as triton_http
 from google.protobuf.descriptor import Descriptor
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
+from tritonclient.grpc import model_config_pb2 as published_config
 from tritonclient.grpc import service_pb2 as published
 from tritonclient.utils import InferenceServerException
 
@@ -62,6 +63,21 @@ async def inferred(client: Any, kind: Any) -> list[np.ndarray[Any, Any]]:
     return [found.as_numpy(name) for name in ("disparity", "sigma")]
 
 
+def config_of(config: Any) -> dict[str, tuple[str, list[int]]]:
+    """Type and shape of each tensor in a configuration, from JSON or from a message."""
+    if isinstance(config, dict):
+        tensors = config["input"] + config["output"]
+        return {
+            each["name"]: (each["data_type"].removeprefix("TYPE_"), each["dims"])
+            for each in tensors
+        }
+    kind = published_config.DataType.Name
+    return {
+        each.name: (kind(each.data_type).removeprefix("TYPE_"), list(each.dims))
+        for each in (*config.input, *config.output)
+    }
+
+
 async def test_tritons_clients_infer_a_pair_over_grpc_and_http(model: OnnxStereoModel) -> None:
     answers = []
     async with running_server(model, model__min_range_share=0) as server:
@@ -77,6 +93,14 @@ async def test_tritons_clients_infer_a_pair_over_grpc_and_http(model: OnnxStereo
                 inputs = about["inputs"] if isinstance(about, dict) else about.inputs
                 named = [each["name"] if isinstance(each, dict) else each.name for each in inputs]
                 assert named == ["left", "right"]
+                config = await client.get_model_config("matcher")
+                config = config if isinstance(config, dict) else config.config
+                assert config_of(config) == {
+                    "left": ("UINT8", [1, -1, -1, 3]),
+                    "right": ("UINT8", [1, -1, -1, 3]),
+                    "disparity": ("FP32", [1, -1, -1]),
+                    "sigma": ("FP32", [1, -1, -1]),
+                }
                 answers.append(await inferred(client, kind))
                 with pytest.raises(InferenceServerException, match="there is no model 'other'"):
                     await client.get_model_metadata("other")
@@ -99,10 +123,24 @@ def fields(message: Descriptor) -> dict[str, Any]:
     }
 
 
+def assert_part_of(ours: dict[str, Any], theirs: dict[str, Any]) -> None:
+    for name, (*about, inner) in ours.items():
+        *their_about, their_inner = theirs[name]
+        assert about == their_about, name
+        if inner is not None:
+            assert_part_of(inner, their_inner)
+
+
 def test_every_message_is_that_of_the_published_protocol() -> None:
     theirs = published.DESCRIPTOR.message_types_by_name
+    configs = published_config.DESCRIPTOR.message_types_by_name
     for name, ours in pb.DESCRIPTOR.message_types_by_name.items():
-        assert fields(ours) == fields(theirs[name]), name
+        if "Config" in name or name in configs:  # the configuration of Triton has more fields
+            assert_part_of(fields(ours), fields({**theirs, **configs}[name]))
+        else:
+            assert fields(ours) == fields(theirs[name]), name
+    numbers = published_config.DataType.items()
+    assert set(pb.DataType.items()) <= set(numbers)
     service = published.DESCRIPTOR.services_by_name["GRPCInferenceService"].methods_by_name
     for method in pb.DESCRIPTOR.services_by_name["GRPCInferenceService"].methods:
         assert method.input_type.name == service[method.name].input_type.name

@@ -73,7 +73,7 @@ async def test_a_server_says_that_it_lives_is_ready_and_what_it_takes(
         assert about["name"] == "matcher"
         assert [each["name"] for each in about["inputs"]] == ["left", "right"]
         assert [each["datatype"] for each in about["outputs"]] == ["FP32", "FP32"]
-    for path in ("", "/ready"):
+    for path in ("", "/ready", "/config"):
         other = await web.get(f"/v2/models/other{path}")
         assert (other.status_code, "error" in other.json()) == (404, True)
 

@@ -20,6 +20,7 @@ from vergence_service.transports.callers import CALLER
 
 SERVER = "vergence"
 MODEL_VERSION = "1"
+CONFIGURATION = "model_configuration"  # an extension of Triton
 INPUTS = ("left", "right")
 INPUT_TYPE = "UINT8"
 INPUT_SHAPE = (1, -1, -1, 3)

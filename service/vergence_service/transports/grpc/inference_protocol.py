@@ -56,6 +56,7 @@ class InferenceServicer:
             "ModelReady": (pb.ModelReadyRequest, self._model_ready),
             "ServerMetadata": (pb.ServerMetadataRequest, self._server_metadata),
             "ModelMetadata": (pb.ModelMetadataRequest, self._model_metadata),
+            "ModelConfig": (pb.ModelConfigRequest, self._model_config),
         }
         self.handlers: dict[str, grpc.RpcMethodHandler[Any, Any]] = {
             "ModelInfer": grpc.unary_unary_rpc_method_handler(self._model_infer),
@@ -82,7 +83,9 @@ class InferenceServicer:
         self, _: pb.ServerMetadataRequest, context: Context
     ) -> pb.ServerMetadataResponse:
         return pb.ServerMetadataResponse(
-            name=open_inference.SERVER, version=open_inference.server_version()
+            name=open_inference.SERVER,
+            version=open_inference.server_version(),
+            extensions=[open_inference.CONFIGURATION],
         )
 
     async def _model_metadata(
@@ -103,6 +106,20 @@ class InferenceServicer:
             inputs=[taken(name=each) for each in open_inference.INPUTS],
             outputs=[given(name=each) for each in open_inference.OUTPUTS],
         )
+
+    async def _model_config(
+        self, request: pb.ModelConfigRequest, context: Context
+    ) -> pb.ModelConfigResponse:
+        await self._check_model(request.name, request.version, context)
+        taken = partial(pb.ModelInput, data_type=pb.TYPE_UINT8, dims=open_inference.INPUT_SHAPE)
+        given = partial(pb.ModelOutput, data_type=pb.TYPE_FP32, dims=open_inference.OUTPUT_SHAPE)
+        config = pb.ModelConfig(
+            name=self._engine.card.name,
+            platform=self._engine.computed_by,
+            input=[taken(name=each) for each in open_inference.INPUTS],
+            output=[given(name=each) for each in open_inference.OUTPUTS],
+        )
+        return pb.ModelConfigResponse(config=config)
 
     async def _model_infer(self, request: bytes, context: Context) -> bytes:
         async with errors_as_status(context):

@@ -81,7 +81,7 @@ def inference_routes(engine: DepthEngine, places: Places, *, limits: UploadLimit
         return {
             "name": open_inference.SERVER,
             "version": open_inference.server_version(),
-            "extensions": ["binary_tensor_data"],
+            "extensions": ["binary_tensor_data", open_inference.CONFIGURATION],
         }
 
     @router.get("/v2/health/live")
@@ -102,6 +102,11 @@ def inference_routes(engine: DepthEngine, places: Places, *, limits: UploadLimit
             return _unknown(missing)
         return JSONResponse(_metadata(engine))
 
+    async def model_config(model: Annotated[str, PathParameter()]) -> Response:
+        if (missing := open_inference.no_such_model(model, "", engine)) is not None:
+            return _unknown(missing)
+        return JSONResponse(_config(engine))
+
     async def infer(model: Annotated[str, PathParameter()], request: Request) -> Response:
         if (missing := open_inference.no_such_model(model, "", engine)) is not None:
             return _unknown(missing)
@@ -121,6 +126,7 @@ def inference_routes(engine: DepthEngine, places: Places, *, limits: UploadLimit
     for path in model_paths:
         router.add_api_route(path, model_metadata, methods=["GET"], response_model=None)
         router.add_api_route(f"{path}/ready", model_ready, methods=["GET"], response_model=None)
+        router.add_api_route(f"{path}/config", model_config, methods=["GET"], response_model=None)
         router.add_api_route(f"{path}/infer", infer, methods=["POST"], response_model=None)
     return router
 
@@ -147,6 +153,24 @@ def _metadata(engine: DepthEngine) -> dict[str, Any]:
         "platform": engine.computed_by,
         "inputs": inputs,
         "outputs": outputs,
+    }
+
+
+def _config(engine: DepthEngine) -> dict[str, Any]:
+    """Return what Triton's tools for measuring ask for, beside the metadata."""
+    inputs, outputs = (
+        [{"name": name, "data_type": f"TYPE_{kind}", "dims": shape} for name in names]
+        for names, kind, shape in (
+            (open_inference.INPUTS, open_inference.INPUT_TYPE, open_inference.INPUT_SHAPE),
+            (open_inference.OUTPUTS, open_inference.OUTPUT_TYPE, open_inference.OUTPUT_SHAPE),
+        )
+    )
+    return {
+        "name": engine.card.name,
+        "platform": engine.computed_by,
+        "max_batch_size": 0,  # one pair a request
+        "input": inputs,
+        "output": outputs,
     }
 
 
