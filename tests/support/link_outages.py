@@ -35,8 +35,8 @@ from vergence import (
 from vergence_proto.types import StereoFrame
 from vergence_service.inference.model import RecurrentState, Step, StereoView
 
-# Zenoh takes ten seconds to close a session whose link is dead.
-_LEFT_AT_MOST_S = 15.0
+# Zenoh gives up an attempt to connect after five seconds.
+_LEFT_AT_MOST_S = 6.0
 _PERIOD_S = 1 / 30
 _EXACT = OutputFormat(encoding=PlaneEncoding.FLOAT32)
 

@@ -21,6 +21,7 @@ from zenoh.handlers import Callback
 
 from vergence_proto import codec
 from vergence_proto.errors import DepthError, ModelFailed
+from vergence_proto.zenoh.closing import close_without_lingering
 from vergence_proto.zenoh.json5_keys import keys_of
 from vergence_proto.zenoh.keys import encoding_of, server_of
 from vergence_proto.zenoh.link_settings import LEASE_MS, WAITS_BEFORE_DROP
@@ -125,11 +126,11 @@ class ZenohSession:
     async def close(self) -> None:
         """Close the session, and with it everything that it declared.
 
-        A session whose link is dead takes ten seconds to close, and a thread goes on with that.
+        What takes longer, a thread goes on with.
         """
         self._closed = True
         # The interpreter does not exit while a session is open.
-        closing = asyncio.wrap_future(self._threads.submit(self._session.close))
+        closing = asyncio.wrap_future(self._threads.submit(close_without_lingering, self._session))
         self._threads.shutdown(wait=False)
         done, _ = await asyncio.wait({closing}, timeout=_CLOSE_S)
         if done:
@@ -267,7 +268,7 @@ class ZenohSession:
 def _close(opening: "Future[zenoh.Session]") -> None:
     """Close a session that nobody waits for any more."""
     if not opening.cancelled() and opening.exception() is None:
-        opening.result().close()
+        close_without_lingering(opening.result())
 
 
 def _received(reply: zenoh.Reply) -> QueryReply:
