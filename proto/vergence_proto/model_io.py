@@ -48,6 +48,9 @@ UVD_CURR_FROM_PREV = "uvd_curr_from_prev"
 DISPARITY = "disparity"
 SIGMA = "sigma"
 
+# Models without weights and without a manifest, and whether each carries a state.
+CLASSICAL_MODELS = {"sgbm": False, "sgbm-half": False, "patchmatch": True}
+
 MANIFEST_NAME = "manifest.json"
 MANIFEST_FORMAT = 2
 

@@ -343,7 +343,9 @@ def test_the_command_adds_lists_checks_and_the_server_finds_the_model(
     assert "vergence serve --model theirs" in added.output
     assert "like igev" in added.output
     listed = run.invoke(models, ["list"])
-    assert "theirs" in listed.output
+    for name in ("theirs", "lite", "sgbm", "patchmatch"):
+        assert name in listed.output
+    assert "sgbm" not in run.invoke(models, ["list", "--weights", str(user_models_dir())]).output
     checked = run.invoke(models, ["check", "theirs"])
     assert "proven on textures" in checked.output
     refused = run.invoke(models, ["add", str(path), "--factor", "-1"])

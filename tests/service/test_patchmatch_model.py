@@ -11,6 +11,7 @@ from tests.support.server import running_server
 from tests.support.session_frames import EXACT
 from vergence import Delivery, DepthClient, Origin
 from vergence_proto.datasets import open_source
+from vergence_proto.model_io import CLASSICAL_MODELS
 from vergence_service.app.server import make_model
 from vergence_service.inference.installed import ProviderUnavailable
 from vergence_service.inference.model import Step, StereoView, state_bytes
@@ -90,3 +91,9 @@ def test_another_engine_is_refused() -> None:
     flags = {"model.name": "patchmatch", "model.engine": "onnxruntime"}
     with pytest.raises(ProviderUnavailable, match="OpenCV computes patchmatch"):
         make_model(load_settings(flags=flags))
+
+
+def test_every_classical_model_is_served_with_the_memory_that_lists_say() -> None:
+    for name, remembers in CLASSICAL_MODELS.items():
+        with closing(make_model(load_settings(flags={"model.name": name}))) as model:
+            assert (model.card.name, model.card.recurrent) == (name, remembers)

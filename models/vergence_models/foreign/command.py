@@ -139,16 +139,22 @@ def _add(
 
 @models.command("list")
 def _list(weights: WeightsOption = None) -> None:
-    """List the models of a folder."""
+    """List the models of a folder; without --weights, of all that can be served."""
     with _in_one_line():
         from rich.console import Console
         from rich.table import Table
 
         from vergence_models.foreign.files import read_manifest
+        from vergence_proto.model_io import CLASSICAL_MODELS
 
         folder = _folder(weights)
+        entries = sorted(read_manifest(folder)["models"].items())
         table = Table("model", "contract", "iterations", "size", "memory", "proven")
-        for name, entry in sorted(read_manifest(folder)["models"].items()):
+        if weights is None:
+            # Where the server looks first: the weights in the package.
+            own = read_manifest(Path(__file__).parents[1] / "weights")["models"]
+            entries = sorted(own.items()) + entries
+        for name, entry in entries:
             about = entry.get("foreign", {})
             size = about.get("contract", {}).get("size")
             stride = f"multiples of {entry['stride']}"
@@ -160,6 +166,10 @@ def _list(weights: WeightsOption = None) -> None:
                 "yes" if entry["state"] else "none",
                 "yes" if about.get("proven", True) else "no",
             )
+        if weights is None:
+            for name, remembers in CLASSICAL_MODELS.items():
+                memory = "yes" if remembers else "none"
+                table.add_row(name, "classical", "", "any", memory, "yes")
         console = Console()
         console.print(f"models in {folder}", soft_wrap=True, highlight=False)
         console.print(table)

@@ -28,11 +28,17 @@ from vergence_models.foreign.compose import (
 )
 from vergence_models.foreign.contract import Contract, ContractError
 from vergence_models.foreign.trial import first_line
-from vergence_proto.model_io import MANIFEST_FORMAT, MANIFEST_NAME, ManifestError, StepMemory
+from vergence_proto.model_io import (
+    CLASSICAL_MODELS,
+    MANIFEST_FORMAT,
+    MANIFEST_NAME,
+    ManifestError,
+    StepMemory,
+)
 
 _MOST_BYTES = (2 << 30) - (16 << 20)  # protobuf's limit of one message, with room for the names
 # The server finds these before it looks into the user's folder.
-_OWN_NAMES = {"lite", "full", "fast", "sgbm", "sgbm-half", "patchmatch"}
+_OWN_NAMES = {"lite", "full", "fast", *CLASSICAL_MODELS}
 _CHECKPOINT = (b"\x80", b"PK")  # how a pickle begins, and a zip of them
 _NAME = re.compile(r"[a-z0-9][a-z0-9._-]*")
 

@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from vergence_proto.extras import how_to_install
+from vergence_proto.model_io import CLASSICAL_MODELS
 from vergence_service.inference.installed import ProviderUnavailable
 from vergence_service.inference.opencv_model import OpenCvModel
 from vergence_service.inference.patchmatch_model import PATCHMATCH_MODEL, PatchMatchModel
-from vergence_service.inference.sgbm_model import SGBM_MODELS, SgbmModel
+from vergence_service.inference.sgbm_model import SgbmModel
 
 if TYPE_CHECKING:
     from vergence_service.inference.native_model import NativeStereoModel
@@ -44,7 +45,7 @@ def load_model(
     Raises ManifestError if the manifest cannot be used, and ProviderUnavailable if the engine or
     its execution provider cannot be used.
     """
-    if name in SGBM_MODELS or name == PATCHMATCH_MODEL:
+    if name in CLASSICAL_MODELS:
         if engine != "auto":
             raise ProviderUnavailable(
                 f"OpenCV computes {name}; set model.engine to auto, not {engine!r}"
