@@ -14,6 +14,9 @@ _UNITS = ((31_557_600.0, "years"), (86_400.0, "days"), (3600.0, "hours"), (1.0, 
 _INT64 = range(-(2**63), 2**63)
 # Another clock is off by years, or by the time since the machine was started: minutes at least.
 _AGES_S = (-1.0, 120.0)
+# A session's first frame is no older if its times are of the clock; on a machine that was started a
+# minute ago, times that count from 0 are near the clock's too.
+_FIRST_AGE_S = 2.0
 # No stereo camera is faster: its times are microseconds, milliseconds or seconds.
 _LEAST_STEP_NS = 100_000
 
@@ -22,34 +25,39 @@ class CaptureClock:
     """The clock of one session's frames, which checks their times.
 
     ``now_ns`` returns the time of that clock, and every frame must then be of it. Without one,
-    times should be those of ``time.monotonic_ns()`` if the session is ``live``.
+    times should be those of ``time.monotonic_ns()`` if the session is ``live``, and must go on to
+    be once they were.
     """
 
     def __init__(self, now_ns: Callable[[], int] | None = None, *, live: bool = True) -> None:
-        self._stated = now_ns is not None
         self.now_ns: Callable[[], int] = now_ns or time.monotonic_ns
         self._latest_ns: int | None = None
         self._warn_of_steps = True
-        self._warn_of_ages = live
+        self._live = live
+        self._first = True  # no time was checked yet
+        self._keeps = now_ns is not None  # every time must be of the clock
 
     def checked_ns(self, capture_ns: object) -> int:
         """Return the time; now for None. Log once what is odd about the times.
 
         Raises BadShape: it is no whole number, does not fit 64 bits, or is impossible on the clock
-        that was stated.
+        that was stated, or that the earlier times were of.
         """
         if capture_ns is None:
             return _whole(self.now_ns())
         whole_ns = _whole(capture_ns)
-        if self._stated and math.isnan(self.age_s(whole_ns)):
+        age_s = self.age_s(whole_ns)
+        if self._keeps and math.isnan(age_s):
             raise BadShape(
                 "expected a capture_ns of the last two minutes of the session's clock, got "
                 f"{_distance(whole_ns - self.now_ns())}; state the clock of your camera as clock="
             )
         step_ns = whole_ns - self._latest_ns if self._latest_ns is not None else 0
         self._latest_ns = whole_ns
-        if self._warn_of_ages and math.isnan(self.age_s(whole_ns)):
-            self._warn_of_ages = False
+        first, self._first = self._first, False
+        if self._live and first:
+            self._keeps = self._keeps or age_s < _FIRST_AGE_S
+        if self._live and first and math.isnan(age_s):
             log.warning("capture_ns is no time of time.monotonic_ns(): the ages of results are NaN")
         if self._warn_of_steps and 0 < step_ns < _LEAST_STEP_NS:
             self._warn_of_steps = False

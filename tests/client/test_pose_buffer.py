@@ -119,3 +119,16 @@ async def test_a_session_has_one_clock_and_refuses_what_is_impossible_on_it(
         assert session.depth_at(AT_REST, max_age_s=60) is not None
         assert session.submit(frame.left, frame.right, frame.pose) is not NotSent.CREDIT
         assert (await anext(session)).capture_ns > captured_ns
+
+
+async def test_a_live_session_whose_clock_changes_refuses_the_other_clock(
+    client: DepthClient,
+) -> None:
+    frame = make_frame(1)
+    async with client.open_session(RIG) as session:
+        assert session.submit(frame.left, frame.right, capture_ns=time.monotonic_ns())
+        assert 0 <= (await anext(session)).age_s < 60
+        with pytest.raises(BadShape, match=r"years after its now; state the clock .* as clock="):
+            session.submit(frame.left, frame.right, capture_ns=time.time_ns())
+        assert session.submit(frame.left, frame.right, capture_ns=time.monotonic_ns())
+        assert 0 <= (await anext(session)).age_s < 60
