@@ -15,6 +15,8 @@ process of their own. Each row has:
 - ``cpu_ms``: CPU time of the server per answer, with transport and codec.
 
 ``plain``: the same streams on a loop of 40 lines over the same model, without Vergence's service.
+``triton``: the same streams as sequences of Triton's sequence batcher, over the same model in its
+Python backend; ``--triton`` names the site-packages of an environment with nvidia-pytriton.
 ``beside``: what a 30 Hz stream keeps of its fair share beside expensive neighbours. Its fair share
 is what it gets beside as many neighbours like itself, measured just before. Each camera has a
 process of its own here: what a neighbour's client does is no cost of the service.
@@ -31,7 +33,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -54,6 +56,9 @@ from tests.support.plain_loop import plain_loop, plain_stream
 DISPARITY_PX = 12
 STAGGER_S = 0.013  # between the starts of two cameras, which are not synchronous
 LEAD_S = 4.0  # cameras run for so long before it counts
+
+
+Kind = Literal["vergence", "plain", "triton"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,9 +112,16 @@ class Server:
     pid: int
 
     def cpu_s(self) -> float:
-        """Return the CPU time of all its threads until now."""
-        fields = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")  # user, system
+        """Return the CPU time of the process and its children until now."""
+        ticks = 0
+        waiting = [str(self.pid)]
+        while waiting:
+            about = Path("/proc") / waiting.pop()
+            fields = (about / "stat").read_text().rpartition(")")[2].split()
+            ticks += int(fields[11]) + int(fields[12])  # user, system
+            for children in about.glob("task/*/children"):
+                waiting += children.read_text().split()
+        return ticks / os.sysconf("SC_CLK_TCK")
 
 
 @asynccontextmanager
@@ -175,9 +187,12 @@ async def stream(address: str, camera: Camera, starts_s: float, counted_s: float
 
 
 def in_a_process(
-    address: str, cameras: list[Camera], starts_s: float, counted_s: float, plain: bool
+    address: str, cameras: list[Camera], starts_s: float, counted_s: float, kind: Kind
 ) -> list[Outcome]:
-    one = plain_stream if plain else stream
+    if kind == "triton":  # its client is of the extra dev
+        from tests.support.triton_loop import triton_stream as one
+    else:
+        one = plain_stream if kind == "plain" else stream
 
     async def all_of_them() -> list[Outcome]:
         outcomes: list[Outcome] = await asyncio.gather(
@@ -198,7 +213,10 @@ async def apart(server: Server, cameras: list[Camera], *, seconds: float) -> lis
         loop = asyncio.get_running_loop()
         running = [
             loop.run_in_executor(
-                None, pool.apply, in_a_process, (server.address, [each], starts_s, seconds, False)
+                None,
+                pool.apply,
+                in_a_process,
+                (server.address, [each], starts_s, seconds, "vergence"),
             )
             for each in cameras
         ]
@@ -207,14 +225,14 @@ async def apart(server: Server, cameras: list[Camera], *, seconds: float) -> lis
 
 
 async def together(
-    server: Server, cameras: list[Camera], *, seconds: float, plain: bool = False
+    server: Server, cameras: list[Camera], *, seconds: float, kind: Kind
 ) -> tuple[list[Outcome], float]:
     """Run the cameras in a process of their own; return also the server's CPU time."""
     starts_s = time.monotonic() + 2.0 + LEAD_S + 0.1 * len(cameras)
     loop = asyncio.get_running_loop()
     with multiprocessing.get_context("spawn").Pool(1) as pool:
         running = loop.run_in_executor(
-            None, pool.apply, in_a_process, (server.address, cameras, starts_s, seconds, plain)
+            None, pool.apply, in_a_process, (server.address, cameras, starts_s, seconds, kind)
         )
         await asyncio.sleep(starts_s - time.monotonic())
         before_s = server.cpu_s()
@@ -242,7 +260,7 @@ def row(
     }
 
 
-async def rows_of(server: Server, args: argparse.Namespace, *, plain: bool) -> dict[str, Any]:
+async def rows_of(server: Server, args: argparse.Namespace, kind: Kind) -> dict[str, Any]:
     offers = {f"{count}": [args.rate_hz] * count for count in args.streams}
     if not args.no_fast:
         offers["2 at 72 and 2 at 15 Hz"] = [72.0, 72.0, 15.0, 15.0]
@@ -253,14 +271,14 @@ async def rows_of(server: Server, args: argparse.Namespace, *, plain: bool) -> d
         cameras = [Camera(rate_hz=each) for each in rates]
         # A stream among many has few answers, and so few do not show who gets how much.
         seconds = args.seconds * max(1, len(rates) // 16)
-        outcomes, cpu_s = await together(server, cameras, seconds=seconds, plain=plain)
+        outcomes, cpu_s = await together(server, cameras, seconds=seconds, kind=kind)
         if len(rates) == 1:
             lone = outcomes[0]
             transport_s = float(np.median(lone.ages_s) - np.median(lone.steps_s))
         rows[name] = row(
             outcomes, cpu_s, seconds=seconds, rate_hz=rates[0], transport_s=transport_s
         )
-        show(("plain " if plain else "") + name, rows[name])
+        show(name if kind == "vergence" else f"{kind} {name}", rows[name])
     return rows
 
 
@@ -280,12 +298,17 @@ async def measure(args: argparse.Namespace) -> dict[str, Any]:
     figures: dict[str, Any] = {}
     async with serving(args.weights, args.threads) as server:
         if not args.no_streams:
-            figures["streams"] = await rows_of(server, args, plain=False)
+            figures["streams"] = await rows_of(server, args, "vergence")
         if not args.no_beside:
             figures["beside"] = await rows_beside(server, args)
     if not args.no_plain:
         with plain_loop(args.weights, args.threads) as (address, pid):
-            figures["plain"] = await rows_of(Server(address, pid), args, plain=True)
+            figures["plain"] = await rows_of(Server(address, pid), args, "plain")
+    if args.triton is not None:
+        from tests.support.triton_loop import triton_loop
+
+        with triton_loop(args.weights, args.threads, args.triton) as (address, pid):
+            figures["triton"] = await rows_of(Server(address, pid), args, "triton")
     return figures
 
 
@@ -312,6 +335,7 @@ def main() -> None:
     )
     parser.add_argument("--threads", type=int, default=2, help="of the model")
     parser.add_argument("--no-plain", action="store_true", help="without the plain loop")
+    parser.add_argument("--triton", type=Path, help="site-packages with nvidia-pytriton")
     parser.add_argument("--no-streams", action="store_true", help="without the rows of the service")
     parser.add_argument("--no-beside", action="store_true", help="without expensive neighbours")
     parser.add_argument("--no-fast", action="store_true", help="without the rows of 72 and 15 Hz")
