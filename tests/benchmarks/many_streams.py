@@ -225,7 +225,7 @@ async def apart(server: Server, cameras: list[Camera], *, seconds: float) -> lis
 
 
 async def together(
-    server: Server, cameras: list[Camera], *, seconds: float, kind: Kind
+    server: Server, cameras: list[Camera], *, seconds: float, kind: Kind = "vergence"
 ) -> tuple[list[Outcome], float]:
     """Run the cameras in a process of their own; return also the server's CPU time."""
     starts_s = time.monotonic() + 2.0 + LEAD_S + 0.1 * len(cameras)
