@@ -38,7 +38,7 @@ def new_key() -> Mapping[str, str]:
 
 
 class AsyncBatchJob:
-    """A job on a server; :meth:`AsyncBatchClient.submit` or :meth:`AsyncBatchClient.job` makes it.
+    """A job on a server; :meth:`vergence.AsyncBatchClient.submit` makes it, or ``job`` there.
 
     Every method raises UnknownSequence if the job was deleted or has expired, and ConnectionLost if
     the server cannot be reached.
@@ -53,7 +53,7 @@ class AsyncBatchJob:
 
     @property
     def id(self) -> str:
-        """The id of the job, for :meth:`AsyncBatchClient.job`."""
+        """The id of the job, for :meth:`vergence.AsyncBatchClient.job`."""
         return self.info.id
 
     async def refresh(self) -> JobInfo:
