@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.support.certificates import Authority
-from tests.support.fleet import Envoy, free_port
+from tests.support.fleet import Envoy
 from tests.support.frames import RIG
 from tests.support.models import RecallModel
 from tests.support.polling import eventually
@@ -57,15 +57,11 @@ async def front(folder: Path) -> AsyncIterator[Front]:
     tokens = TokenFile(folder / "tokens.toml", "ana", "ben")
     flags: dict[str, Any] = {"security__tokens": str(tokens.path), "server__drain_s": 0.5}
     flags["limits__streams"] = 16
-    ports = free_port(), free_port()
-    own: list[dict[str, Any]] = [
-        {"http__port": port, "batch__address": f"http://127.0.0.1:{port}"} for port in ports
-    ]
     with redis_server() as store:
         flags["snapshots__store"] = flags["batch__servers"] = store.url
         async with (
-            running_server(RecallModel(), **flags, **own[0]) as a,
-            running_server(RecallModel(), **flags, **own[1]) as b,
+            running_server(RecallModel(), **flags) as a,
+            running_server(RecallModel(), **flags) as b,
         ):
             envoy.lead_to([(each.grpc_address, each.http_address) for each in (a, b)])
             try:

@@ -10,6 +10,7 @@ from typing import Any
 import httpx
 import pytest
 
+from tests.support.certificates import Authority
 from tests.support.fleet import free_port
 from tests.support.models import RecallModel
 from tests.support.polling import eventually_true
@@ -20,6 +21,7 @@ from tests.support.tokens import TokenFile
 from vergence.jobs.client import AsyncBatchClient
 from vergence_proto.errors import UnknownSequence
 from vergence_service.app.server import Running
+from vergence_service.settings import SettingsError
 
 pytestmark = pytest.mark.slow  # it needs redis-server
 
@@ -49,14 +51,9 @@ async def two_servers(
         store = stack.enter_context(redis_server())
         started = []
         for _ in range(2):
-            port = free_port()
-            flags: dict[str, Any] = {
-                "security__tokens": str(tokens.path),
-                "batch__servers": store.url,
-                "batch__address": f"http://127.0.0.1:{port}",
-                "http__port": port,
-            }
-            started.append(await stack.enter_async_context(running_server(RecallModel(), **flags)))
+            flags = {"security__tokens": str(tokens.path), "batch__servers": store.url, **more}
+            server = running_server(model or RecallModel(), **flags)
+            started.append(await stack.enter_async_context(server))
         yield Servers(started[0], started[1], store, tokens.tokens)
 
 
@@ -170,3 +167,24 @@ async def test_followers_that_leave_end_their_requests_at_the_other_server(
                         )
 
                 await eventually_true(follows)
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        ({"security__tls_cert": "CERT", "security__tls_key": "KEY"}, "a name of the certificate"),
+        ({"server__host": "0.0.0.0", "security__insecure": True}, "other machines do not reach"),
+    ],
+    ids=["tls", "loopback"],
+)
+async def test_a_server_that_others_would_not_find_does_not_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flags: dict[str, Any], expected: str
+) -> None:
+    monkeypatch.setattr("socket.gethostbyname", lambda name: "127.0.1.1")  # as Debian has it
+    issued = Authority(tmp_path).issue("front")
+    files = {"CERT": str(issued.cert), "KEY": str(issued.key)}
+    with pytest.raises(SettingsError, match=expected):
+        async with two_servers(
+            tmp_path, **{name: files.get(str(value), value) for name, value in flags.items()}
+        ):
+            pass

@@ -140,7 +140,7 @@ async def serving_http(
         )
         shared: ASGIApp = app
         port = listening.getsockname()[1]
-        if queue and (passing := with_other_servers(app, queue, settings, port=port)):
+        if queue and (passing := with_other_servers(app, queue, settings, host=host, port=port)):
             shared = await stack.enter_async_context(passing)
         server = await stack.enter_async_context(
             HttpServer(

@@ -4,8 +4,9 @@ import socket
 
 from starlette.types import ASGIApp
 
+from vergence_service.app.security import is_loopback
 from vergence_service.jobs.queue import JobQueue
-from vergence_service.settings import Settings
+from vergence_service.settings import Settings, SettingsError
 from vergence_service.transports.errors import ExtraMissing
 from vergence_service.transports.http.other_servers import OtherServers
 
@@ -13,11 +14,11 @@ _REDIS_S = 1.0  # no frame waits for it
 
 
 def with_other_servers(
-    app: ASGIApp, queue: JobQueue, settings: Settings, *, port: int
+    app: ASGIApp, queue: JobQueue, settings: Settings, *, host: str, port: int
 ) -> OtherServers | None:
     """Make an application that passes requests on; None: there are no others.
 
-    Raises ExtraMissing.
+    Raises ExtraMissing, and SettingsError: it is not known how the others reach this server.
     """
     batch = settings.batch
     if batch.servers == "none":
@@ -27,15 +28,32 @@ def with_other_servers(
     except ModuleNotFoundError:
         raise ExtraMissing("Redis", "fleet") from None
     directory = RedisDirectory(batch.servers, keep_s=batch.keep_h * 3600, timeout_s=_REDIS_S)
-    address = batch.address or _own_address(settings, port)
+    address = batch.address or _address_of(host, port, tls=settings.security.tls_cert is not None)
     return OtherServers(app, queue, directory=directory, address=address)
 
 
-def _own_address(settings: Settings, port: int) -> str:
-    """Return what containers and pods are reached by: the address of their host name."""
-    scheme = "http" if settings.security.tls_cert is None else "https"
+def _address_of(host: str, port: int, *, tls: bool) -> str:
+    """Return the URL of a server that listens on ``host``.
+
+    That of all interfaces is the address of the host's name, as containers and pods have it.
+    """
+    if tls:
+        raise SettingsError(
+            "batch.servers with TLS needs batch.address: https:// and a name of the certificate"
+        )
+    if host in ("0.0.0.0", "::"):
+        host = _address_of_this_host()
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+
+
+def _address_of_this_host() -> str:
+    name = socket.gethostname()
     try:
-        host = socket.gethostbyname(socket.gethostname())
+        address = socket.gethostbyname(name)
     except OSError:
-        host = "127.0.0.1"
-    return f"{scheme}://{host}:{port}"
+        address = "127.0.0.1"
+    if is_loopback(address):
+        raise SettingsError(
+            f"batch.servers needs batch.address: other machines do not reach {name} at {address}"
+        )
+    return address

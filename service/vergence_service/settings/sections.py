@@ -303,7 +303,7 @@ class BatchSettings(Section):
         default=None,
         pattern=r"^https?://[^/\s]+$",
         description="URL of this server's HTTP port for the others of batch.servers; default: "
-        "the address of its host name",
+        "where it listens, or the address of its host name",
     )
     idle_s: PositiveFloat = Field(
         default=30.0, description="abort an upload that sends nothing for this long"

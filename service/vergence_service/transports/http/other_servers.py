@@ -8,6 +8,7 @@ other server checks; so nothing is copied, and no server needs the disk of anoth
 import asyncio
 import logging
 import re
+import ssl
 from collections.abc import AsyncIterator, Sequence
 from typing import Self
 from urllib.parse import parse_qs
@@ -66,6 +67,7 @@ class OtherServers:
         self._http = httpx.AsyncClient(
             timeout=httpx.Timeout(None, connect=_CONNECT_S),  # an answer may wait for a job
             limits=httpx.Limits(max_connections=_CONNECTIONS),
+            verify=ssl.create_default_context(),  # the system's authorities, or SSL_CERT_FILE
             trust_env=False,
         )
         self._renewing = asyncio.create_task(self._renew())
