@@ -54,10 +54,18 @@ _FEEDS: dict[str, Feeds] = {
     "openstereo": _two("left_img", "right_img", _imagenet),
     "ess": _two("input_left", "input_right", lambda image: (_bytes(image) - 127.5) / 127.5),
     "hitnet": lambda a, b: {"input": _planes(np.concatenate([a, b], axis=2) / np.float32(255))},
+    "hitnet of both views": lambda a, b: {
+        "input": _planes(np.concatenate([a, b], axis=2) / np.float32(255))
+    },
     "hitnet of grey images": lambda a, b: {
         "input": _planes(np.concatenate([_grey(a), _grey(b)], axis=2) / np.float32(255))
     },
     "crestereo": _halves,
+    "crestereo without halves": _two("left", "right", _bytes),
+    "coex": _two("left", "right", _imagenet),
+    "cgi-stereo": _two("left", "right", lambda image: _bytes(image) / 255),
+    "liteanystereo": _two("left", "right", _bytes),
+    "foundationstereo": _two("left_image", "right_image", _imagenet),
     "igev": _two("image1", "image2", _bytes),
     "sixteenths, channels last": lambda a, b: {
         "a": _bytes(a)[None] / 255,
@@ -68,6 +76,7 @@ _FROM_OUTPUT: dict[str, Callable[[Plane], Plane]] = {
     "raft": lambda found: -found,
     "raft of any size": lambda found: -found,
     "crestereo": lambda found: found[:, 0],
+    "crestereo without halves": lambda found: found[:, 0],
     "sixteenths, channels last": lambda found: found / 16,
 }
 

@@ -93,7 +93,7 @@ def two_images(
     channels_last: bool = False,
     free: bool = False,
     confidence: str = "",
-    bgr: bool = False,
+    flow: bool = False,
 ) -> ModelProto:
     """Two images; the output is the disparity divided by ``factor``."""
     graph = Graph()
@@ -106,6 +106,9 @@ def two_images(
     size: Shape = ["H", "W"] if free else [HEIGHT, WIDTH]
     batch: Shape = ["B"] if free else [1]
     shape: Shape = [*batch, 1, *size]
+    if flow:  # with a second channel, which is zero
+        nothing = graph.add("Sub", result, result)
+        result, shape = graph.add("Concat", result, nothing, axis=1), [*batch, 2, *size]
     if squeezed:
         result, shape = graph.add("Squeeze", result, graph.constant([1], np.int64)), batch + size
     graph.give(output, result)
@@ -118,8 +121,8 @@ def two_images(
     return graph.model({left: image, right: image}, outputs)
 
 
-def joined(channels: int) -> ModelProto:
-    """HITNet: both images in one input, and the map in NHWC."""
+def joined(channels: int, *, of_both: bool = False) -> ModelProto:
+    """HITNet: both images in one input, and the map in NHWC; ``of_both`` adds the right view's."""
     graph = Graph()
     half = channels // 2
     ends = [graph.constant([each], np.int64) for each in (0, half, channels)]
@@ -128,10 +131,22 @@ def joined(channels: int) -> ModelProto:
     lights = [graph.brightness(each, UNIT, half) for each in views]
     result = graph.add("Transpose", graph.match(lights), perm=[0, 2, 3, 1])
     graph.give("reference_output_disparity", result)
-    return graph.model(
-        {"input": [1, channels, HEIGHT, WIDTH]},
-        {"reference_output_disparity": [1, HEIGHT, WIDTH, 1]},
-    )
+    outputs: dict[str, Shape] = {"reference_output_disparity": [1, HEIGHT, WIDTH, 1]}
+    if of_both:
+        mirrored = [
+            graph.add(
+                "Slice",
+                each,
+                graph.constant([-1], np.int64),
+                graph.constant([-WIDTH - 1], np.int64),
+                graph.constant([3], np.int64),
+                graph.constant([-1], np.int64),
+            )
+            for each in reversed(lights)
+        ]
+        graph.give("secondary_output_disparity", graph.match(mirrored))
+        outputs["secondary_output_disparity"] = [1, 1, HEIGHT, WIDTH]
+    return graph.model({"input": [1, channels, HEIGHT, WIDTH]}, outputs)
 
 
 def with_halves() -> ModelProto:
@@ -197,6 +212,28 @@ GRAPHS = {
     ),
     "hitnet": Layout(lambda: joined(6), "0..1", 1, "hitnet"),
     "hitnet of grey images": Layout(lambda: joined(2), "0..1", 1, "hitnet"),
+    "hitnet of both views": Layout(lambda: joined(6, of_both=True), "0..1", 1, "hitnet"),
+    "crestereo without halves": Layout(
+        lambda: two_images("left", "right", "output", BYTES, flow=True), "0..255", 1, "crestereo"
+    ),
+    "coex": Layout(
+        lambda: two_images("left", "right", "disp", IMAGENET, squeezed=True), "imagenet", 1, "coex"
+    ),
+    "cgi-stereo": Layout(
+        lambda: two_images("left", "right", "output", UNIT, squeezed=True), "0..1", 1, "cgi-stereo"
+    ),
+    "liteanystereo": Layout(
+        lambda: two_images("left", "right", "disparity", BYTES, free=True),
+        "0..255",
+        1,
+        "liteanystereo",
+    ),
+    "foundationstereo": Layout(
+        lambda: two_images("left_image", "right_image", "disparity", IMAGENET),
+        "imagenet",
+        1,
+        "foundationstereo",
+    ),
     "crestereo": Layout(with_halves, "0..255", 1, "crestereo"),
     "igev": Layout(lambda: two_images("image1", "image2", "disp_up", BYTES), "0..255", 1, "igev"),
     "sixteenths, channels last": Layout(
