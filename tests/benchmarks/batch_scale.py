@@ -1,6 +1,7 @@
 """Measure jobs at the size that laboratories have: a long one, many small ones, a long queue.
 
     python tests/benchmarks/batch_scale.py --json FILE
+    python tests/benchmarks/batch_scale.py --frames 300 --rows 100    # a check, of a minute
 
 The bundled sequence, walked to and fro, is made as long as ``--frames`` says. The server is a real
 process, and the bare loop runs in this one before and after the job.
@@ -46,6 +47,7 @@ SMALL_JOBS, SMALL_FRAMES = 40, 8
 TAR = {"Content-Type": "application/x-tar"}
 POLL_S = 0.1  # clients that ask more often take the time of the job
 LIST_S = 10.0
+AT_ONCE = 4
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
@@ -158,6 +160,10 @@ def write_walk(folder: Path, frames: int, width: int) -> Path:
     return folder
 
 
+def say(what: str) -> None:
+    print(time.strftime("%H:%M:%S"), what, file=sys.stderr, flush=True)  # noqa: T201  progress
+
+
 def packed(folder: Path) -> bytes:
     return b"".join(Upload(folder).chunks_now())
 
@@ -172,8 +178,9 @@ async def small_jobs_per_s(server: Server, archive: bytes) -> float:
 
 async def healthz_p99_ms(server: Server, archive: bytes, rows: int) -> tuple[float, float]:
     """Time of /healthz, and of a page, while another client reads pages of a long queue."""
-    for _ in range(rows):
-        await server.submit(archive)
+    for begin in range(0, rows, AT_ONCE):
+        count = min(AT_ONCE, rows - begin)
+        await asyncio.gather(*(server.submit(archive) for _ in range(count)))
     over = time.perf_counter() + LIST_S
     health_ms: list[float] = []
     pages_ms: list[float] = []
@@ -198,18 +205,24 @@ async def measure(args: argparse.Namespace) -> dict[str, Any]:
         small = packed(write_walk(folder / "small", SMALL_FRAMES, args.width))
         source = open_source(f"vergence:{long}")
         bare = BareLoop(source.rig, 0)
+        say("bare loop")
         before_fps = bare.fps(source)
         async with serving(folder, args.engine) as server:
             figures: dict[str, Any] = {"server_rss_begin_mib": server.rss_mib()}
+            say("one job")
             job_id = await server.submit(packed(long))
             fps, busy = await server.fps(job_id, frames=args.frames)
             job = await server.until(job_id, args.frames)
             figures["server_rss_after_job_mib"] = server.rss_mib()
+            say("two jobs")
             two = [await server.submit(half) for _ in range(2)]
             two_fps, two_busy = await server.fps(*two, frames=args.frames // 2)
+            say(f"{SMALL_JOBS} small jobs")
             figures["small_jobs_per_s"] = await small_jobs_per_s(server, small)
+            say(f"{args.rows} jobs in the queue")
             health_ms, page_ms = await healthz_p99_ms(server, small, args.rows)
             figures["server_rss_mib"] = server.rss_mib()
+        say("bare loop again")
         after_fps = bare.fps(source)
     return {
         "frames": args.frames,

@@ -9,7 +9,7 @@ import asyncio
 import logging
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -88,8 +88,9 @@ class StepBatcher:
         self._metrics = metrics
         self._waiting: list[_Waiting] = []
         self._in_model: list[_Waiting] = []
-        self._free_lanes = asyncio.Semaphore(lanes)
-        self._changed = asyncio.Event()  # set when a step arrives or leaves the model
+        self._free_lanes = lanes
+        self._changed = asyncio.Event()  # set when a step waits, or one has left the model
+        self._running: set[asyncio.Task[None]] = set()
         self._arrivals = ArrivalPredictor()
         metrics.streams_predicted.set_function(lambda: len(self._arrivals))
         self._shares = Shares()
@@ -151,7 +152,10 @@ class StepBatcher:
             here = [*self._waiting, *self._in_model]
             self._shares.enter(owner, [each.owner for each in here if not each.live])
         self._waiting.append(item)
-        self._changed.set()
+        if self._max_batch == 1:
+            self._start_ready()  # a batch of one waits for no neighbour
+        if self._waiting:
+            self._changed.set()
         return await answer
 
     def forget(self, stream_id: str) -> None:
@@ -159,34 +163,47 @@ class StepBatcher:
         self._arrivals.forget(stream_id)
 
     async def _run(self) -> None:
-        async with asyncio.TaskGroup() as lanes:
+        try:
             while True:
-                await self._free_lanes.acquire()
-                batch = await self._next_batch()
-                self._in_model += batch
-                lanes.create_task(self._in_lane(batch))
+                hold_s = self._start_ready()
+                self._changed.clear()
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(self._changed.wait(), hold_s)
+        finally:
+            for lane in self._running:
+                lane.cancel()
+            await asyncio.gather(*self._running, return_exceptions=True)
 
-    async def _in_lane(self, batch: list[_Waiting]) -> None:
-        with self._memory.stepping(self._bytes_of(batch)):
+    async def _in_lane(self, batch: list[_Waiting], memory: ExitStack) -> None:
+        with memory:
             await self._step_together(batch)
         # Not reached when cancelled: __aexit__ then answers the steps that have no answer.
         self._in_model = [item for item in self._in_model if item not in batch]
-        self._free_lanes.release()
-        self._changed.set()
+        self._free_lanes += 1
+        if self._waiting:
+            self._changed.set()
 
-    async def _next_batch(self) -> list[_Waiting]:
-        """Return the next work of the model, as soon as it may start."""
-        while True:
+    def _start_ready(self) -> float | None:
+        """Start the work that may start now.
+
+        Returns the time until other work may start; None: that only a change can tell.
+        """
+        while self._free_lanes:
             batch = self._oldest()
             hold_s = self._hold_s(batch[0]) if batch else None
             if hold_s == 0 and not self._memory.may_step(self._bytes_of(batch)):
                 hold_s = None  # until another step has ended
-            if hold_s == 0:
-                self._waiting = [item for item in self._waiting if item not in batch]
-                return batch
-            self._changed.clear()
-            with suppress(TimeoutError):
-                await asyncio.wait_for(self._changed.wait(), hold_s)
+            if hold_s != 0:
+                return hold_s
+            self._waiting = [item for item in self._waiting if item not in batch]
+            self._in_model += batch
+            self._free_lanes -= 1
+            memory = ExitStack()  # counted from now on: the next batch must not get it too
+            memory.enter_context(self._memory.stepping(self._bytes_of(batch)))
+            lane = asyncio.create_task(self._in_lane(batch, memory))
+            self._running.add(lane)
+            lane.add_done_callback(self._running.discard)
+        return None
 
     def _bytes_of(self, batch: Sequence[_Waiting]) -> int:
         step = batch[0].step
