@@ -82,7 +82,10 @@ print(json.dumps([resident("VmHWM") - before, most]))
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @pytest.mark.parametrize(
     ("name", "sizes"),
-    [("sgbm", [(480, 640), (200, 1600), (800, 1280)]), ("patchmatch", [(480, 640), (120, 1280)])],
+    [
+        ("sgbm", [(480, 640), (200, 1600), (800, 1280)]),
+        pytest.param("patchmatch", [(480, 640), (120, 1280)], marks=pytest.mark.slow),
+    ],
     ids=["sgbm", "patchmatch"],
 )
 def test_classical_methods_take_no_more_memory_than_they_are_said_to_take(
