@@ -112,8 +112,14 @@ class Film:
 
     def figures(self, cut_s: float, return_s: float) -> dict[str, Any]:
         """Return what the outage cost."""
-        before = [each for at_s, each in self.results if at_s < cut_s]
-        after = [(at_s, each) for at_s, each in self.results if at_s >= return_s]
+        # By their capture: answers that were on their way may arrive after the cut.
+        cut_ns = cut_s * 1e9
+        before = [each for _, each in self.results if each.capture_ns < cut_ns]
+        after = [
+            (at_s, each)
+            for at_s, each in self.results
+            if at_s >= return_s and each.capture_ns >= cut_ns
+        ]
         warm_s = next(
             (at_s for at_s, each in after if each.origin in (Origin.WARM, Origin.RESUMED)), None
         )
