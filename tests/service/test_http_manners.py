@@ -143,6 +143,13 @@ async def test_a_page_token_of_another_list_is_refused(token: str, tmp_path: Pat
     assert "page_token" in answer.text
 
 
+@pytest.mark.parametrize("label", ["hall", ":hall", "my site:hall", "site=hall"])
+async def test_a_label_without_a_key_is_refused(label: str, tmp_path: Path) -> None:
+    async with as_ana(tmp_path) as client:
+        answer = await client.get("/v1/sequences", params={"label": label})
+    assert (answer.status_code, reason_of(answer)) == (400, "BAD_SHAPE")
+
+
 @pytest.mark.parametrize(
     "other",
     ["-29168", "1.5", "2.4e-105", "2026-01-31", "2026-01-31T12:00:00", "2026-01-31T12:00Z", "now"],

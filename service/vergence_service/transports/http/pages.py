@@ -33,7 +33,9 @@ class ListQuery(BaseModel):
 
     state: list[JobState] = Field(default=[], description="only jobs in these states")
     name: str | None = Field(default=None, max_length=200, description="only jobs of this name")
-    label: list[str] = Field(default=[], description="only jobs with all these labels, KEY:VALUE")
+    label: list[Annotated[str, Field(pattern=LABEL)]] = Field(
+        default=[], description="only jobs with all these labels, KEY:VALUE"
+    )
     created_after: Annotated[datetime, BeforeValidator(_date_time)] | None = Field(
         default=None, description="only jobs created since"
     )
