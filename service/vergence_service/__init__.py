@@ -1,7 +1,8 @@
 """The server: it keeps one recurrent state per stream and answers frames with disparity.
 
-Read the packages from the bottom up: ``inference`` (the model), ``streams`` (states and the
-engine), ``jobs`` (uploaded sequences), ``transports`` (gRPC, HTTP, Zenoh), ``app`` (composition).
+Read the packages from the bottom up: ``process`` (threads, memory, metrics) and ``access``
+(principals), ``inference`` (the model), ``snapshots``, ``streams`` (states and the engine),
+``jobs`` (uploaded sequences), ``transports`` (gRPC, HTTP, Zenoh), ``settings``, ``app``.
 """
 
 import os

@@ -8,7 +8,7 @@ import pytest
 import yaml
 from prometheus_client import CollectorRegistry
 
-from vergence_service.metrics import Metrics
+from vergence_service.process.metrics import Metrics
 from vergence_service.settings import load_settings
 
 DOCKER = Path(__file__).parents[2] / "docker"

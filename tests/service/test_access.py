@@ -410,7 +410,7 @@ async def test_the_environment_and_the_command_make_and_show_tokens(
 ) -> None:
     def command(*words: str) -> subprocess.CompletedProcess[str]:
         code = (
-            "import typer; from vergence_service.token_command import token; "
+            "import typer; from vergence_service.app.token_command import token; "
             "app = typer.Typer(); app.command()(token); app()"
         )
         file = ("--file", str(tmp_path / "tokens.toml"))

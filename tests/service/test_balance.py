@@ -16,7 +16,7 @@ from tests.support.server import RawCall, running_server
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_proto.v1 import depth_pb2_grpc
 from vergence_service.app.server import Running
-from vergence_service.memory import MemoryKind
+from vergence_service.process.memory import MemoryKind
 
 PROTOBUF = {"content-type": "application/x-protobuf"}
 OWN_CONNECTION = [("grpc.use_local_subchannel_pool", 1)]

@@ -17,8 +17,8 @@ from vergence_proto.geometry import RectifiedRig
 from vergence_proto.types import Timings
 from vergence_service.inference.batcher import StepBatcher
 from vergence_service.inference.model import Step, StepResult, StereoView
-from vergence_service.memory import MemoryBudget
-from vergence_service.metrics import Metrics
+from vergence_service.process.memory import MemoryBudget
+from vergence_service.process.metrics import Metrics
 
 
 def make_batcher(

@@ -369,7 +369,8 @@ async def test_close_stream_returns_when_the_streams_own_connection_has_ended() 
 def test_descriptors_are_raised_and_connections_are_fewer_if_they_are_scarce() -> None:
     code = (
         "import resource\n"
-        "from vergence_service.descriptors import affordable_connections, raise_descriptor_limit\n"
+        "from vergence_service.process.descriptors import affordable_connections\n"
+        "from vergence_service.process.descriptors import raise_descriptor_limit\n"
         "raise_descriptor_limit()\n"
         "print(resource.getrlimit(resource.RLIMIT_NOFILE)[0])\n"
         "print(affordable_connections(1000), affordable_connections(8))\n"

@@ -21,9 +21,9 @@ from vergence_proto.errors import (
 )
 from vergence_proto.geometry import Axes, Pose
 from vergence_proto.types import Delivery, DisparityMap, Origin, PoseSample, StereoFrame, StereoRig
+from vergence_service.process.threads import Cost
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.stream import StreamConfig
-from vergence_service.threads import Cost
 
 OPENING = StreamConfig(StereoRig.from_rectified(RIG))
 

@@ -16,7 +16,7 @@ from tests.support.status import reason_of, unpack_detail
 from vergence import DepthClient
 from vergence_proto.errors import Quota
 from vergence_proto.types import StereoRig
-from vergence_service.memory import MemoryKind
+from vergence_service.process.memory import MemoryKind
 from vergence_service.streams.rectify import Rectifier
 from vergence_service.streams.search_window import SearchReach
 

@@ -11,9 +11,9 @@ import pytest
 
 from tests.support.server import ManualClock
 from vergence_proto.errors import BadShape, ModelFailed, NotReady, StateMemory
-from vergence_service.failures import error_of
-from vergence_service.logs import BoundedRate, JsonLines
-from vergence_service.native_output import decoder_of
+from vergence_service.process.failures import error_of
+from vergence_service.process.logs import BoundedRate, JsonLines
+from vergence_service.process.native_output import decoder_of
 
 
 class Lines(logging.Handler):
@@ -109,7 +109,7 @@ from collections import Counter
 from tests.support.mutants import damaged, image_files
 from vergence_proto.codec.images import decode_image
 from vergence_proto.errors import BadImage
-from vergence_service.native_output import native_output
+from vergence_service.process.native_output import native_output
 
 logging.basicConfig(stream=sys.stdout, format="log: %(message)s")
 chance, files = random.Random(3), list(image_files().values())

@@ -9,8 +9,8 @@ from vergence_proto.codec import ReceivedFrame
 from vergence_proto.errors import FrameOutOfOrder
 from vergence_proto.types import Delivery
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_service.memory import MemoryBudget
-from vergence_service.metrics import Metrics
+from vergence_service.process.memory import MemoryBudget
+from vergence_service.process.metrics import Metrics
 from vergence_service.transports.mailbox import Mailbox, QueuedFrame
 
 BUDGET = MemoryBudget(1 << 20, metrics=Metrics(CollectorRegistry()))

@@ -6,13 +6,13 @@ import sys
 
 import pytest
 
-from vergence_service.malloc import keep_freed_memory
+from vergence_service.process.malloc import keep_freed_memory
 
 FRAMES = 20
 SCRIPT = f"""
 import resource
 import numpy as np
-from vergence_service.malloc import keep_freed_memory
+from vergence_service.process.malloc import keep_freed_memory
 
 assert keep_freed_memory()
 

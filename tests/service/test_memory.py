@@ -12,8 +12,8 @@ from prometheus_client import CollectorRegistry
 
 from tests.support.polling import turns
 from vergence_proto.errors import FrameTooLarge, StateMemory
-from vergence_service.memory import MemoryBudget, MemoryHold, MemoryKind, StreamMemory
-from vergence_service.metrics import Metrics
+from vergence_service.process.memory import MemoryBudget, MemoryHold, MemoryKind, StreamMemory
+from vergence_service.process.metrics import Metrics
 
 LIMIT = 100
 NBYTES = st.integers(0, 40)
@@ -139,7 +139,7 @@ def test_steps_run_side_by_side_only_in_memory_that_nothing_else_uses() -> None:
 
 _UNDER_A_LIMIT = """
 import resource
-from vergence_service.memory import TooLittleMemory, affordable_bytes
+from vergence_service.process.memory import TooLittleMemory, affordable_bytes
 
 used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
 print(affordable_bytes(1 << 40) == 1 << 40)

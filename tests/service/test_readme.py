@@ -8,7 +8,7 @@ from prometheus_client import CollectorRegistry
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from vergence_service.metrics import Metrics
+from vergence_service.process.metrics import Metrics
 from vergence_service.settings import Settings
 
 README = (Path(__file__).parents[2] / "service" / "README.md").read_text("utf-8")

@@ -14,10 +14,10 @@ from tests.support.server import running_server
 from vergence_proto.errors import BadCalibration
 from vergence_proto.geometry import Pose
 from vergence_proto.types import Distortion, Intrinsics, PoseSample, StereoFrame, StereoRig
+from vergence_service.process.threads import Cost
 from vergence_service.streams.rectify import Rectifier, check_rig
 from vergence_service.streams.search_window import SearchReach
 from vergence_service.streams.stream import StreamConfig
-from vergence_service.threads import Cost
 
 WIDTH, HEIGHT = 320, 240
 # Toed in, rolled a little, and not quite level.

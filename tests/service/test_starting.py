@@ -24,8 +24,9 @@ from vergence_proto.errors import NotReady
 from vergence_proto.types import Delivery, StereoRig
 from vergence_service.inference.batcher import StepBatcher
 from vergence_service.jobs.store import JobStore, StoreInUse
-from vergence_service.memory import MemoryBudget
-from vergence_service.metrics import Metrics
+from vergence_service.process.memory import MemoryBudget
+from vergence_service.process.metrics import Metrics
+from vergence_service.process.threads import Threads
 from vergence_service.streams import engine as engine_module
 from vergence_service.streams.continuity import ContinuityLimits
 from vergence_service.streams.engine import DepthEngine
@@ -33,7 +34,6 @@ from vergence_service.streams.needs import ImageSizes
 from vergence_service.streams.quotas import Quotas
 from vergence_service.streams.stream import StreamConfig
 from vergence_service.streams.table import StreamTable
-from vergence_service.threads import Threads
 from vergence_service.transports.errors import PortTaken
 
 OPENING = StreamConfig(StereoRig.from_rectified(RIG))

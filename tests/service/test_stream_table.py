@@ -19,8 +19,8 @@ from vergence_proto.errors import (
     UnknownStream,
 )
 from vergence_proto.types import StereoRig
-from vergence_service.memory import MemoryBudget, MemoryKind, StreamMemory
-from vergence_service.metrics import Metrics
+from vergence_service.process.memory import MemoryBudget, MemoryKind, StreamMemory
+from vergence_service.process.metrics import Metrics
 from vergence_service.streams.quotas import Quotas
 from vergence_service.streams.rectify import Rectifier
 from vergence_service.streams.stream import Notice, Stream, StreamConfig

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.polling import turns
-from vergence_service.threads import ThreadPool, Threads, to_the_end
+from vergence_service.process.threads import ThreadPool, Threads, to_the_end
 
 SERVICE = Path(__file__).parents[2] / "service" / "vergence_service"
 
@@ -156,4 +156,4 @@ def test_the_service_works_in_no_other_threads() -> None:
         if re.search(r"\bto_thread\(|run_in_executor\(None|ThreadPoolExecutor\(", path.read_text())
     }
     # The batcher and the graphs own the threads of the model.
-    assert found == {"threads.py", "inference/batcher.py", "inference/graphs.py"}
+    assert found == {"process/threads.py", "inference/batcher.py", "inference/graphs.py"}

@@ -28,8 +28,8 @@ from vergence_proto.zenoh.inbox import Inbox
 from vergence_proto.zenoh.keys import ANY, StreamKeys, query_key
 from vergence_proto.zenoh.session import QueryReply, ZenohSession, make_config
 from vergence_service.app.server import Running
+from vergence_service.app.zenoh_command import zenoh_config
 from vergence_service.transports.errors import ExtraMissing, ZenohUnreachable
-from vergence_service.zenoh_command import zenoh_config
 
 NAMESPACE = "vergence"
 MINE = "0123456789abcdef" * 2

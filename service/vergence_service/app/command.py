@@ -13,10 +13,10 @@ from typing import Any, NoReturn
 from vergence_proto.model_io import ManifestError
 from vergence_service.app.security import check_exposure
 from vergence_service.app.server import Running, serve
-from vergence_service.descriptors import raise_descriptor_limit
 from vergence_service.inference.installed import ProviderUnavailable
-from vergence_service.logs import start_logging
-from vergence_service.malloc import keep_freed_memory, save_address_space
+from vergence_service.process.descriptors import raise_descriptor_limit
+from vergence_service.process.logs import start_logging
+from vergence_service.process.malloc import keep_freed_memory, save_address_space
 from vergence_service.settings import SettingsError, load_settings
 from vergence_service.transports.errors import ExtraMissing, PortTaken, ZenohUnreachable
 

@@ -23,16 +23,17 @@ from vergence_service.app.security import (
 )
 from vergence_service.app.snapshots import make_snapshots
 from vergence_service.app.zenoh import ZenohTransport, serving_zenoh
-from vergence_service.descriptors import affordable_connections
 from vergence_service.inference.batcher import StepBatcher
 from vergence_service.inference.engines import load_model
 from vergence_service.inference.installed import packaged_weights_dir
 from vergence_service.inference.model import StereoModel
 from vergence_service.jobs.places import Places
 from vergence_service.jobs.queue import JobQueue
-from vergence_service.memory import MemoryBudget, affordable_bytes
-from vergence_service.metrics import Metrics
-from vergence_service.native_output import native_output
+from vergence_service.process.descriptors import affordable_connections
+from vergence_service.process.memory import MemoryBudget, affordable_bytes
+from vergence_service.process.metrics import Metrics
+from vergence_service.process.native_output import native_output
+from vergence_service.process.threads import Threads
 from vergence_service.settings import Settings
 from vergence_service.streams.continuity import ContinuityLimits
 from vergence_service.streams.engine import DepthEngine
@@ -41,7 +42,6 @@ from vergence_service.streams.quotas import Quotas
 from vergence_service.streams.stream import Stream
 from vergence_service.streams.table import StreamTable
 from vergence_service.streams.turns import Turns
-from vergence_service.threads import Threads
 from vergence_service.transports.addresses import format_address
 from vergence_service.transports.errors import ExtraMissing
 from vergence_service.transports.grpc.inference_protocol import InferenceServicer

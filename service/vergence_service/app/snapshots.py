@@ -2,10 +2,10 @@
 
 import time
 
-from vergence_service.metrics import Metrics
+from vergence_service.process.metrics import Metrics
+from vergence_service.process.threads import Threads
 from vergence_service.settings import Settings
 from vergence_service.snapshots.saver import Snapshots
-from vergence_service.threads import Threads
 from vergence_service.transports.errors import ExtraMissing
 
 

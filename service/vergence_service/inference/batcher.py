@@ -15,13 +15,13 @@ from typing import Self
 
 from vergence_proto.errors import DepthError, Draining, FrameStale, ModelFailed
 from vergence_proto.types import Timings
-from vergence_service.failures import out_of_memory
 from vergence_service.inference.arrivals import ArrivalPredictor
 from vergence_service.inference.model import Step, StepResult, StereoModel
 from vergence_service.inference.shares import Shares
-from vergence_service.memory import MemoryBudget
-from vergence_service.metrics import Metrics
-from vergence_service.threads import Cost
+from vergence_service.process.failures import out_of_memory
+from vergence_service.process.memory import MemoryBudget
+from vergence_service.process.metrics import Metrics
+from vergence_service.process.threads import Cost
 
 log = logging.getLogger(__name__)
 

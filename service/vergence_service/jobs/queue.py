@@ -37,8 +37,8 @@ from vergence_service.jobs.tally import tally_of
 from vergence_service.jobs.upload_checks import checking_folder
 from vergence_service.jobs.webhooks import WebhookHosts, WebhookSender
 from vergence_service.jobs.worker import JobWorker
+from vergence_service.process.threads import to_the_end
 from vergence_service.streams.engine import DepthEngine
-from vergence_service.threads import to_the_end
 
 log = logging.getLogger(__name__)
 

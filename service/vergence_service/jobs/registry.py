@@ -21,7 +21,7 @@ from vergence_service.jobs.progress import JobProgress, JobStatus
 from vergence_service.jobs.results import has_frames
 from vergence_service.jobs.storage import disk_trouble, flushing
 from vergence_service.jobs.store import JobStore, folder_bytes
-from vergence_service.threads import ThreadPool, to_the_end
+from vergence_service.process.threads import ThreadPool, to_the_end
 
 # The expected duration of a job before any has run. Clients are asked to retry after it.
 _USUAL_JOB_S = 2.0

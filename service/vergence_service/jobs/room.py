@@ -7,7 +7,7 @@ from vergence_service.jobs.kept_uploads import KeptUploads
 from vergence_service.jobs.registry import JobRegistry
 from vergence_service.jobs.storage import check_free, free_bytes
 from vergence_service.jobs.store import JobStore
-from vergence_service.threads import ThreadPool
+from vergence_service.process.threads import ThreadPool
 
 
 class DiskRoom:

@@ -36,10 +36,10 @@ from vergence_service.jobs.sources import open_below, relative_text, sequence_er
 from vergence_service.jobs.stepping import Skipped, Stepped
 from vergence_service.jobs.storage import disk_trouble
 from vergence_service.jobs.tally import FrameCounts
+from vergence_service.process.threads import ThreadPool
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.rectify import Rectifier
 from vergence_service.streams.stream import StreamConfig
-from vergence_service.threads import ThreadPool
 
 # Frames that are being written while the next ones are stepped.
 _UNWRITTEN = 2

@@ -28,7 +28,7 @@ from urllib.parse import SplitResult, urlsplit
 from vergence_proto.errors import BadShape
 from vergence_service.jobs.job import Job
 from vergence_service.jobs.registry import JobRegistry
-from vergence_service.threads import ThreadPool
+from vergence_service.process.threads import ThreadPool
 
 log = logging.getLogger(__name__)
 

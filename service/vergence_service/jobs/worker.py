@@ -15,7 +15,6 @@ from vergence_proto.errors import (
     StateMemory,
 )
 from vergence_proto.jobs import JobState
-from vergence_service.failures import error_of
 from vergence_service.jobs.checkpoints import saved_frames
 from vergence_service.jobs.etas import in_turn
 from vergence_service.jobs.job import Job
@@ -26,6 +25,7 @@ from vergence_service.jobs.results import read_records
 from vergence_service.jobs.run import CHECKPOINT, run_job
 from vergence_service.jobs.storage import disk_trouble
 from vergence_service.jobs.tally import tally_of
+from vergence_service.process.failures import error_of
 from vergence_service.streams.engine import DepthEngine
 
 log = logging.getLogger(__name__)

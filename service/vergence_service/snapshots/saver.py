@@ -7,7 +7,8 @@ from collections.abc import Callable, Coroutine
 from typing import Any, Self
 
 from vergence_service.inference.snapshots import BadSnapshot
-from vergence_service.metrics import Metrics
+from vergence_service.process.metrics import Metrics
+from vergence_service.process.threads import ThreadPool
 from vergence_service.snapshots.snapshot import StreamSnapshot
 from vergence_service.snapshots.store import (
     Claim,
@@ -18,7 +19,6 @@ from vergence_service.snapshots.store import (
     SnapshotStore,
     StoreUnavailable,
 )
-from vergence_service.threads import ThreadPool
 
 log = logging.getLogger(__name__)
 

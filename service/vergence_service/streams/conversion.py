@@ -10,8 +10,8 @@ from vergence_proto.accuracy import confidence_from_sigma
 from vergence_proto.errors import BadShape
 from vergence_proto.geometry import Axes, Pose
 from vergence_proto.types import DisparityMap, Origin, StereoFrame, Timings
-from vergence_service.failures import out_of_memory
 from vergence_service.inference.model import StepResult, StereoView
+from vergence_service.process.failures import out_of_memory
 from vergence_service.streams.rectify import Rectifier
 from vergence_service.streams.stream import Stream
 

@@ -22,11 +22,12 @@ from vergence_proto.types import (
     Timings,
 )
 from vergence_service.access.principals import LOCAL, Principal
-from vergence_service.failures import out_of_memory
 from vergence_service.inference.batcher import StepBatcher
 from vergence_service.inference.model import RecurrentState, Step, StereoModel, StereoView
-from vergence_service.memory import MemoryBudget, StreamMemory
-from vergence_service.metrics import Metrics
+from vergence_service.process.failures import out_of_memory
+from vergence_service.process.memory import MemoryBudget, StreamMemory
+from vergence_service.process.metrics import Metrics
+from vergence_service.process.threads import Cost, Threads
 from vergence_service.snapshots.saver import Snapshots
 from vergence_service.streams.continuity import ContinuityLimits
 from vergence_service.streams.conversion import SteppedFrame, decoded_view
@@ -40,7 +41,6 @@ from vergence_service.streams.table import StreamTable
 from vergence_service.streams.traces import FrameTraces
 from vergence_service.streams.turns import Turns
 from vergence_service.streams.viewers import Viewers
-from vergence_service.threads import Cost, Threads
 
 # A client that comes while the model loads waits for at most this long. It is below the time that
 # the SDK waits for a stream to open, 5 s.

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from vergence_proto.errors import BadCalibration, FrameTooLarge
 from vergence_proto.types import StereoRig
 from vergence_service.inference.model import StereoModel, state_bytes
-from vergence_service.memory import StreamMemory
+from vergence_service.process.memory import StreamMemory
 from vergence_service.streams.search_window import SearchReach, SearchWindow
 
 # Smaller images have nothing to match. The network would still see them as wide as its search.

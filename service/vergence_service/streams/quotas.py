@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from vergence_proto.errors import Quota
 from vergence_service.access.principals import Principal
-from vergence_service.memory import StreamMemory
+from vergence_service.process.memory import StreamMemory
 from vergence_service.streams.stream import Stream
 
 _MIB = 1 << 20

@@ -7,7 +7,7 @@ from statistics import median
 from prometheus_client import Counter, Gauge
 from prometheus_client.samples import Sample
 
-from vergence_service.memory import MemoryKind
+from vergence_service.process.memory import MemoryKind
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.quotas import megapixels_per_s
 from vergence_service.streams.stream import Stream

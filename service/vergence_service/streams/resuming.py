@@ -12,7 +12,7 @@ from vergence_proto.errors import (
 )
 from vergence_proto.types import Origin, StereoRig
 from vergence_service.access.principals import Principal
-from vergence_service.memory import StreamMemory
+from vergence_service.process.memory import StreamMemory
 from vergence_service.snapshots.saver import Snapshots, new_owner
 from vergence_service.snapshots.snapshot import (
     StreamSnapshot,

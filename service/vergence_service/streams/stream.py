@@ -11,7 +11,7 @@ from vergence_proto.geometry import Axes
 from vergence_proto.types import Delivery, Origin, OutputFormat, StereoRig
 from vergence_service.access.principals import LOCAL, Principal
 from vergence_service.inference.model import RecurrentState, StereoView
-from vergence_service.memory import MemoryHold
+from vergence_service.process.memory import MemoryHold
 from vergence_service.snapshots.saver import StreamSaver
 from vergence_service.streams.continuity import ContinuityLimits, break_between
 from vergence_service.streams.rectify import Rectifier

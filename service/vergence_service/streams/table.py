@@ -21,9 +21,9 @@ from vergence_proto.errors import (
 )
 from vergence_proto.types import Origin, StereoRig, checked_stream_id
 from vergence_service.access.principals import LOCAL, Principal
-from vergence_service.logs import log_event
-from vergence_service.memory import MemoryBudget, MemoryHold, StreamMemory
-from vergence_service.metrics import Metrics
+from vergence_service.process.logs import log_event
+from vergence_service.process.memory import MemoryBudget, MemoryHold, StreamMemory
+from vergence_service.process.metrics import Metrics
 from vergence_service.streams.quotas import Quotas, User
 from vergence_service.streams.rectify import Rectifier
 from vergence_service.streams.stream import (

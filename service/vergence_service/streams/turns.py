@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from vergence_service.access.principals import Principal
-from vergence_service.threads import Cost
+from vergence_service.process.threads import Cost
 
 # Steps that are so many times longer than those of others, and longer than this, leave a lane to
 # the others: they could have no turn meanwhile.

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from vergence_proto.codec import ReceivedFrame
 from vergence_proto.errors import FrameOutOfOrder
 from vergence_proto.types import Delivery
-from vergence_service.memory import MemoryHold
+from vergence_service.process.memory import MemoryHold
 
 
 @dataclass(frozen=True, slots=True, eq=False)

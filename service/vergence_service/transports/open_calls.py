@@ -7,7 +7,7 @@ from vergence_proto.codec import Request
 from vergence_proto.errors import DepthError, Draining
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.access.principals import Principal
-from vergence_service.memory import MemoryBudget
+from vergence_service.process.memory import MemoryBudget
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.transports.stream_call import ClientLost, DepthCall, StreamLimits
 

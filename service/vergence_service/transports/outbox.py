@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 
 from vergence_proto import codec
 from vergence_proto.v1 import depth_pb2 as pb
-from vergence_service.failures import out_of_memory
-from vergence_service.metrics import Metrics
+from vergence_service.process.failures import out_of_memory
+from vergence_service.process.metrics import Metrics
+from vergence_service.process.threads import Cost, ThreadPool
 from vergence_service.streams.conversion import SteppedFrame
 from vergence_service.streams.stream import Notice, NoticeKind
-from vergence_service.threads import Cost, ThreadPool
 
 # One map is encoded and sent while the next is stepped. Beyond that the stepper waits for the
 # client to read, and newer frames displace older ones in the mailbox.

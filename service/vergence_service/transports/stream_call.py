@@ -18,11 +18,11 @@ from vergence_proto.errors import (
 from vergence_proto.types import Delivery
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.access.principals import Principal
-from vergence_service.logs import log_event
+from vergence_service.process.logs import log_event
+from vergence_service.process.threads import Cost
 from vergence_service.streams.conversion import SteppedFrame
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.stream import Notice, Stream
-from vergence_service.threads import Cost
 from vergence_service.transports.callers import TRACE_PARENT
 from vergence_service.transports.displaced import DisplacedFrames
 from vergence_service.transports.mailbox import Mailbox, QueuedFrame

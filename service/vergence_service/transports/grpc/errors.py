@@ -11,7 +11,7 @@ from grpc_status import rpc_status
 
 from vergence_proto import codec
 from vergence_proto.errors import DepthError, ErrorCode
-from vergence_service.failures import error_of
+from vergence_service.process.failures import error_of
 
 log = logging.getLogger(__name__)
 

@@ -7,7 +7,7 @@ from fastapi import Request
 
 from vergence_proto.errors import BadShape, ClientTimeout, FrameTooLarge
 from vergence_proto.http_records import RECORD_HEAD_BYTES, RecordKind, read_head
-from vergence_service.memory import MemoryBudget
+from vergence_service.process.memory import MemoryBudget
 
 
 async def body_of(

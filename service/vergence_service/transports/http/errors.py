@@ -14,8 +14,8 @@ from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 
 from vergence_proto.errors import BadShape, DepthError, ErrorCode, InsufficientStorage
-from vergence_service.failures import error_of
 from vergence_service.jobs.storage import disk_trouble
+from vergence_service.process.failures import error_of
 
 log = logging.getLogger(__name__)
 

@@ -21,7 +21,7 @@ from vergence_service.jobs.archive import manifest_of
 from vergence_service.jobs.progress import JobStatus
 from vergence_service.jobs.registry import JobRegistry
 from vergence_service.jobs.results import frame_path, read_made, read_records
-from vergence_service.threads import ThreadPool
+from vergence_service.process.threads import ThreadPool
 from vergence_service.transports.callers import CALLER
 from vergence_service.transports.http.errors import PROBLEM_RESPONSE
 from vergence_service.transports.http.ranges import ranged

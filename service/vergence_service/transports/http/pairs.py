@@ -31,9 +31,9 @@ from vergence_proto.types import (
 )
 from vergence_service.jobs.places import Places
 from vergence_service.jobs.upload_checks import check_file
+from vergence_service.process.threads import ThreadPool
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.streams.stream import StreamConfig
-from vergence_service.threads import ThreadPool
 from vergence_service.transports.callers import CALLER
 from vergence_service.transports.http.errors import PROBLEM_RESPONSE
 from vergence_service.transports.http.uploads import (

@@ -16,7 +16,7 @@ from vergence_service.jobs.archive import CannotEncode, read_pieces, write_film
 from vergence_service.jobs.archive_index import archive_tag, part_of, read_index, recording
 from vergence_service.jobs.job import Job
 from vergence_service.jobs.registry import JobRegistry
-from vergence_service.threads import ThreadPool
+from vergence_service.process.threads import ThreadPool
 from vergence_service.transports.http.ranges import Part, has_already, part_for, wants_part
 
 _NO_CACHE = "private, no-cache"

@@ -18,7 +18,7 @@ from vergence_service.jobs.job import Job
 from vergence_service.jobs.progress import JobStatus
 from vergence_service.jobs.queue import JobOrder, JobQueue
 from vergence_service.jobs.registry import JobRegistry
-from vergence_service.threads import ThreadPool
+from vergence_service.process.threads import ThreadPool
 from vergence_service.transports.callers import CALLER
 from vergence_service.transports.http.errors import PROBLEM_RESPONSE
 from vergence_service.transports.http.frame_routes import frame_routes

@@ -25,7 +25,7 @@ from vergence_proto.http_records import (
 )
 from vergence_proto.v1 import depth_pb2 as pb
 from vergence_service.access.principals import Principal
-from vergence_service.failures import error_of
+from vergence_service.process.failures import error_of
 from vergence_service.transports.callers import CALLER
 from vergence_service.transports.http.bodies import body_of, messages_of
 from vergence_service.transports.http.errors import PROBLEM_RESPONSE, log

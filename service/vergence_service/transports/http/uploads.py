@@ -24,7 +24,7 @@ from vergence_proto.text import decoded_text
 from vergence_service.jobs.archive_limits import ArchiveLimits
 from vergence_service.jobs.archives import ArchiveUnpacker, unpacking
 from vergence_service.jobs.kept_uploads import KeptUpload
-from vergence_service.threads import ThreadPool
+from vergence_service.process.threads import ThreadPool
 from vergence_service.transports.http.bodies import body_of
 from vergence_service.transports.http.forms import FormPart, FormWriter
 

@@ -5,7 +5,7 @@ import logging
 from google.rpc import status_pb2
 
 from vergence_proto import codec
-from vergence_service.failures import error_of
+from vergence_service.process.failures import error_of
 from vergence_service.transports.grpc.errors import GRPC_STATUS
 
 log = logging.getLogger(__name__)

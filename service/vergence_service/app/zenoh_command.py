@@ -11,7 +11,7 @@ import typer
 
 from vergence_service.access.tokens import TokenFileError, read_tokens
 from vergence_service.access.zenoh_rules import client_config, router_config
-from vergence_service.token_command import default_file
+from vergence_service.app.token_command import default_file
 
 _MAX_MESSAGE_BYTES = 40 << 20  # 1.25 times the default of limits.max_frame_mib
 

@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Self
 
 from vergence_proto.errors import FrameTooLarge, StateMemory
-from vergence_service.metrics import Metrics
+from vergence_service.process.metrics import Metrics
 
 if sys.platform != "win32":
     import resource
