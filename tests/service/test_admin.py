@@ -1,7 +1,5 @@
 """The administrator's listener: who is let in, and what there is to see."""
 
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -9,22 +7,15 @@ import httpx
 import pytest
 
 from tests.support.frames import frame_message, make_frame, open_message
+from tests.support.http import admin_of
 from tests.support.models import RecallModel
 from tests.support.polling import eventually_true
 from tests.support.server import PATIENCE_S, RawCall, raw_stream, running_server
 from tests.support.tokens import TokenFile, stub
 from vergence_service.app.security import check_exposure
-from vergence_service.app.server import Running
 from vergence_service.settings import SettingsError, load_settings
 
 PATHS = ("/metrics", "/v1/admin/streams", "/docs", "/", "/openapi.json")
-
-
-@asynccontextmanager
-async def admin_of(server: Running, **headers: str) -> AsyncIterator[httpx.AsyncClient]:
-    base = f"http://{server.admin_address}"
-    async with httpx.AsyncClient(base_url=base, headers=headers, timeout=PATIENCE_S) as client:
-        yield client
 
 
 async def test_every_open_stream_is_one_row() -> None:

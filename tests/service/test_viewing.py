@@ -3,28 +3,24 @@
 import asyncio
 import json
 import struct
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import httpx
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from tests.support.frames import RIG, frame_message, make_frame, open_message
-from tests.support.http import ended, reason_of, submit
+from tests.support.http import admin_of, ended, reason_of, submit
 from tests.support.models import RecallModel
 from tests.support.polling import eventually
 from tests.support.sequences import make_frames, sequence_files, zip_bytes
-from tests.support.server import PATIENCE_S, RawCall, raw_stream, running_server
+from tests.support.server import RawCall, raw_stream, running_server
 from tests.support.tokens import TokenFile, http_as, stub
 from vergence_proto import codec
 from vergence_proto.codec.images import decode_image
 from vergence_proto.types import StereoFrame, StereoRig
-from vergence_service.app.server import Running
 
 RIGS = {
     "as it is": RIG,
@@ -32,13 +28,6 @@ RIGS = {
     "the left one to the right": replace(RIG, cx_left=27.5),
     "wider than a view": replace(RIG, width=1000, height=40, cx_left=500.0, cx_right=500.0),
 }
-
-
-@asynccontextmanager
-async def admin_of(server: Running, **headers: str) -> AsyncIterator[httpx.AsyncClient]:
-    base = f"http://{server.admin_address}"
-    async with httpx.AsyncClient(base_url=base, headers=headers, timeout=PATIENCE_S) as client:
-        yield client
 
 
 def planes_of(view: bytes) -> tuple[dict[str, Any], NDArray[np.uint8], list[NDArray[np.float32]]]:

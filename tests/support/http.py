@@ -40,6 +40,13 @@ async def http_at(address: str, admin_address: str) -> AsyncIterator[httpx.Async
         yield client
 
 
+@asynccontextmanager
+async def admin_of(server: Running, **headers: str) -> AsyncIterator[httpx.AsyncClient]:
+    base = f"http://{server.admin_address}"
+    async with httpx.AsyncClient(base_url=base, headers=headers, timeout=PATIENCE_S) as client:
+        yield client
+
+
 async def metrics_of(client: httpx.AsyncClient) -> str:
     """The metrics of the client's server, which has them on another port."""
     return (await client.get(f"http://{_ADMIN[client]}/metrics")).text

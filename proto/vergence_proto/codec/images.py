@@ -50,12 +50,17 @@ def image_to_wire(
             data: Piece = np.ascontiguousarray(image).data.cast("B")
         case ImageEncoding.JPEG:
             kind = pb.IMAGE_ENCODING_JPEG
-            data = _encoded(image, ".jpg", [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality])
+            data = encode_jpeg(image, jpeg_quality)
         case ImageEncoding.PNG:
             kind = pb.IMAGE_ENCODING_PNG
             data = _encoded(image, ".png", [cv2.IMWRITE_PNG_COMPRESSION, 1])  # 1: the quickest
     header = pb.Image(encoding=kind, width=width, height=height)
     return [header.SerializeToString(), *delimited(pb.Image.DATA_FIELD_NUMBER, data)]
+
+
+def encode_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
+    """Encode uint8 [H, W, 3] RGB or [H, W] grey. Raises BadImage: a JPEG cannot be so large."""
+    return _encoded(image, ".jpg", [cv2.IMWRITE_JPEG_QUALITY, quality])
 
 
 def camera_file(data: bytes) -> ImageFile:

@@ -57,7 +57,7 @@ def plane_to_proto(plane: Plane, output: OutputFormat, *, into: pb.Plane | None 
     match output.encoding:
         case PlaneEncoding.UINT16:
             kind = pb.PLANE_ENCODING_UINT16
-            stored: Stored = _fixed_point(plane, output.denominator)
+            stored: Stored = fixed_point(plane, output.denominator)
         case PlaneEncoding.FLOAT16:
             kind = pb.PLANE_ENCODING_FLOAT16
             stored = plane.astype(_WIRE_TYPES[kind])
@@ -111,7 +111,8 @@ def check_denominator(denominator: int) -> int:
     return denominator
 
 
-def _fixed_point(plane: Plane, denominator: int) -> NDArray[np.uint16]:
+def fixed_point(plane: Plane, denominator: int) -> NDArray[np.uint16]:
+    """Round float32 pixels to whole steps of ``1 / denominator`` px; 0: no value, or below 0."""
     scaled = np.multiply(plane, np.float32(denominator))
     np.fmax(scaled, 0, out=scaled)  # of NaN and a number, fmax takes the number
     np.minimum(scaled, _LARGEST, out=scaled)

@@ -186,7 +186,7 @@ class StepBatcher:
     def _start_ready(self) -> float | None:
         """Start the work that may start now.
 
-        Returns the time until other work may start; None: that only a change can tell.
+        Returns the seconds until waiting work may start; None: it waits for another step.
         """
         while self._free_lanes:
             batch = self._oldest()

@@ -24,7 +24,7 @@ class StreamReport:
     principal: str
     stream_id: str
     transport: str  # grpc, http or zenoh
-    address: str  # of the client; "zenoh" over Zenoh, which does not tell it; empty: not known
+    address: str  # of the client; over Zenoh without a token "zenoh"; empty: not known
     attached: bool
     delivery: str
     width: int

@@ -15,8 +15,9 @@ import cv2
 import numpy as np
 from fastapi import APIRouter, Response
 
+from vergence_proto.codec.images import encode_jpeg
+from vergence_proto.codec.planes import fixed_point
 from vergence_proto.errors import Forbidden
-from vergence_proto.types import Image, Plane
 from vergence_service.streams.conversion import SteppedFrame
 from vergence_service.streams.engine import DepthEngine
 from vergence_service.transports.http.errors import PROBLEM_RESPONSE
@@ -76,10 +77,11 @@ def encode_view(frame: SteppedFrame) -> bytes:
     sigma_px = rectifier.sigma_px(frame.result.sigma_px)
     rig = answer.rig
     every = -(-rig.width // _MOST_COLUMNS)
-    disparity = _fixed_point(answer.disparity_px[::every, ::every])
+    disparity = fixed_point(answer.disparity_px[::every, ::every], _STEPS_PER_PX)
     height, width = disparity.shape
     left = rectifier.window.left_of(frame.view.left, rig.height, rig.width)
-    jpeg = _jpeg(left, width, height)
+    small = cv2.resize(left, (width, height), interpolation=cv2.INTER_AREA)
+    jpeg = encode_jpeg(np.asarray(small, np.uint8), _JPEG_QUALITY)
     header = ViewHeader(
         frame_id=frame.frame_id,
         jpeg_bytes=len(jpeg),
@@ -96,18 +98,5 @@ def encode_view(frame: SteppedFrame) -> bytes:
         step_count=answer.step_count,
     )
     text = json.dumps(dataclasses.asdict(header)).encode()
-    sigma = _fixed_point(sigma_px[::every, ::every])
+    sigma = fixed_point(sigma_px[::every, ::every], _STEPS_PER_PX)
     return struct.pack("<I", len(text)) + text + jpeg + disparity.tobytes() + sigma.tobytes()
-
-
-def _fixed_point(plane: Plane) -> np.ndarray[tuple[int, ...], np.dtype[np.uint16]]:
-    stored = np.nan_to_num(plane * _STEPS_PER_PX, nan=0.0, posinf=0.0)
-    return np.rint(stored).clip(0, 0xFFFF).astype("<u2")
-
-
-def _jpeg(image: Image, width: int, height: int) -> bytes:
-    small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    if small.ndim == 3:
-        small = cv2.cvtColor(small, cv2.COLOR_RGB2BGR)
-    _, encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    return encoded.tobytes()

@@ -48,7 +48,7 @@ class ZenohCall:
         self._caller = caller
         self._live = opening.delivery != pb.DELIVERY_EVERY
         self._paces = opening.paces and self._live
-        # Zenoh does not tell an address. Clients without a name share one, and with it a limit.
+        # Zenoh reports no addresses: all clients without a token count as one address.
         client = "" if caller.proven else "zenoh"
         self._call = calls.make(self._requests(), self._write, client=client, caller=caller)
         self._inbox = Inbox(
